@@ -14,10 +14,10 @@ import sys
 import numpy as np
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.recursion import Recursion
+from calib.estimate.record import Record
 from calib.estimate.reference_share import shared_covariance
+from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.estimate.window_rows import Summary
 from calib.model import Array
 from tests.building_windows import building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE
@@ -30,16 +30,16 @@ CHILDREN = (S_TRUE, S_TRUE @ np.diag([0.99, 1.01, 1.02]))
 MAIN = [0, 4, 8]
 
 
-def child(random: np.random.Generator, error: Array, S: Array) -> Recursion:
+def child(random: np.random.Generator, error: Array, S: Array) -> State:
     """A sensor after its windows beside a reference whose channels indicate (1 + `error`) (3,) of the motion."""
     steady = Wander(dict.fromkeys(Wander.none().values, 0.0))
     priors = Priors(dict(Priors.none().values) | STATED)
-    found = Recursion(PRIOR, U_PRIOR, priors, steady, TemperatureModel(), fixed=False)
+    found = State(PRIOR, U_PRIOR, priors, steady, TemperatureModel(), fixed=False)
     found.meet("A")
     for k in range(WINDOWS):
         Q = Q_TRUE + S @ random.normal(0.0, STATED["offset_mps2"], 3)
         window = building_window(random, level_mps2=(0.3, 0.3, 0.3), reference_error=error, S=S, Q=Q, noise_mps2=0.02)
-        found.update(Summary.of(window, k / 24.0, 0.0, np.nan, "A"))
+        found.update(Record.of(window, k / 24.0, 0.0, np.nan, "A"))
     return found
 
 

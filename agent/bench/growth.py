@@ -10,7 +10,7 @@ import numpy as np
 
 from agent.config import Channel
 from calib.estimate.next_stop import COVERAGE_FACTOR
-from calib.estimate.quantities import S_AND_Q, YEAR_DAYS
+from calib.estimate.quantities import YEAR_DAYS
 from calib.model import Array, scale_of
 
 MONTHS = (0, 1, 3, 6, 12)
@@ -35,7 +35,7 @@ class Growth:
     def variance_after(self, days: float) -> Array:
         """(12,) of S and Q, in the squares of their units."""
         c, scale = self.channel, scale_of(self.sensitivity.ravel())
-        walk = c.wander().variance_a_day(S_AND_Q, scale, c.gravity_mps2)
+        walk = c.wander().variance_a_day(scale, c.gravity_mps2)
         p, t = c.process, c.temperature
         grown = walk * days
         grown[9:] += (scale * p.offset_rate_mps2 * days) ** 2 + (scale * p.offset_rate_walk_mps2) ** 2 * days**3 / 3.0

@@ -269,8 +269,8 @@ class ChannelState:
 
     def _update(self, calibration: Calibration) -> CalibrationUpdate:
         assert self._estimation is not None
-        state, made_by = self._estimation.recursion, self._estimation.maker_of(calibration)
-        return calibration_update(self._source(), calibration, state, made_by, self._references.certificate_of)
+        state, shares = self._estimation.state, self._estimation.shares_of(calibration)
+        return calibration_update(self._source(), calibration, state, shares, self._references.certificate_of)
 
     def number(self, results: Sequence[Result]) -> None:
         """Take the numbers that the results got, so that the calibration in force and waiting estimates have theirs."""
@@ -287,7 +287,7 @@ class ChannelState:
         """Whether the state of the device that is connected now holds more than its configuration states."""
         if self._estimation is None:
             return False
-        taken = self._estimation.recursion.windows or self._in_force is not None
+        taken = self._estimation.state.windows or self._in_force is not None
         return bool(taken or self._estimation.gate.on_hold)
 
     def memory(self) -> bytes:

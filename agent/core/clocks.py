@@ -64,9 +64,9 @@ class Clocks:
 
 
 def _lag(estimation: Estimation | None) -> tuple[float, float]:
-    if estimation is None or "lag" not in estimation.recursion.names:
+    if estimation is None or "lag" not in estimation.state.names:
         return UNKNOWN
-    return estimation.recursion.quantity("lag")
+    return estimation.state.quantity("lag")
 
 
 def _report(

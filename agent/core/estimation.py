@@ -1,9 +1,9 @@
-"""One sensor's S and Q on-line: recursion, gate and drift test, window by window (docs/online.md)."""
+"""One sensor's S and Q on-line: state, gate and drift test, window by window (docs/online.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,16 +11,17 @@ import numpy as np
 from agent.config import Channel
 from agent.core.explaining import explained, most_likely
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
-from agent.core.jump import jumped, possible_jump, tilt_rad
+from agent.core.hypotheses import Devices, confirmed, possible_jump, tilt_rad
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
-from agent.core.witnesses import Witnesses
 from calib.estimate.axes import LEAST_S
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
-from calib.estimate.recursion import Recursion
-from calib.estimate.window_rows import Summary
+from calib.estimate.record import Record
+from calib.estimate.reference_share import ReferenceShare
+from calib.estimate.state import State
+from calib.estimate.statements import Step
 from calib.model import Calibration, Window, WindowSums
 from calib.signal.response import Response
 
@@ -42,13 +43,38 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
+    """An estimate whose windows the state did not take: these windows, the steps that were supposed, and what the
+    calibration owes to the references."""
+
+    calibration: Calibration
+    records: Sequence[Record]
+    steps: Sequence[Step]
+    shares: Sequence[ReferenceShare]
+
+    def snapshot(self) -> dict[str, Any]:
+        """State for `load`, bit-exact."""
+        return {
+            "calibration": fields_of(self.calibration), "records": [record.snapshot() for record in self.records],
+            "steps": [asdict(step) for step in self.steps], "shares": [asdict(share) for share in self.shares],
+        }  # fmt: skip
+
+    @classmethod
+    def load(cls, state: Mapping[str, Any]) -> Proposal:
+        """The proposal whose snapshot this is."""
+        records = [Record.load(record) for record in state["records"]]
+        shares = [ReferenceShare.load(share) for share in state["shares"]]
+        return cls(Calibration(**state["calibration"]), records, [Step(**step) for step in state["steps"]], shares)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Tried:
-    """A window tried on the state: what it says, and the recursion that has taken it."""
+    """A window tried on the state: what it says, and the state that has taken it."""
 
     window_sums: WindowSums
-    summary: Summary
+    record: Record
     innovation: Innovation
-    after: Recursion
+    after: State
 
 
 class Estimation:
@@ -65,14 +91,13 @@ class Estimation:
         u = channel.prior.standard_uncertainty(mean)
         priors, *check = (beside.priors(fixed_mount=fixed) for beside in self._beside)
         walks, temperature = channel.wander(), channel.temperature_model()
-        self.recursion = Recursion(mean, u, priors, walks, temperature, fixed=fixed, check=check)
-        self.in_force, self.law = self.recursion.result(), self.recursion.law()
-        self.residual_sd = self.recursion.residual_sd
-        self.gate = Gate(channel.gate.filled(self.recursion.scale, fixed_mount=fixed), self.in_force)
+        self.state = State(mean, u, priors, walks, temperature, fixed=fixed, check=check)
+        self.in_force, self.law = self.state.result(), self.state.law()
+        self.residual_sd = self.state.residual_sd
+        self.gate = Gate(channel.gate.filled(self.state.scale, fixed_mount=fixed), self.in_force)
         self.drift = DriftTest(channel.drift.settings())
-        self._held: list[Summary] = []
-        self._witnesses = Witnesses([beside.reference for beside in self._beside])
-        self._proposed: list[tuple[Calibration, Recursion]] = []  # proposals whose windows the state did not take
+        self._held: list[Record] = []
+        self._proposed: list[Proposal] = []
         self._tried: Tried | None = None  # what `after` did, for `judge` right after it
         self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
@@ -80,7 +105,13 @@ class Estimation:
     def use(self, place: int) -> None:
         """The next windows are of the reference at this place: 0 is the first one, 1 the second one."""
         self._place = place
-        self.recursion.use(place)
+        self.state.use(place)
+
+    @property
+    def _devices(self) -> Devices:
+        own = self._beside[self._place]
+        others = [beside.reference for place, beside in enumerate(self._beside) if place != self._place]
+        return Devices(own.reference or "", (others[0] or "") if others else "", own.certificate.stability_pct / 100.0)
 
     @property
     def lag_watch(self) -> LagWatch:
@@ -93,34 +124,34 @@ class Estimation:
         for place, beside in enumerate(self._beside):
             if device in (beside.sensor, beside.reference):
                 self.use(place)
-                self.lag_watch.began(self.recursion, device)
+                self.lag_watch.began(self.state, device)
         self.use(present)
 
     @property
     def lag_s(self) -> float:
         """By which the sensor's indications come after the reference's, as far as known."""
-        return self.recursion.lag_s
+        return self.state.lag_s
 
     @property
     def response(self) -> Response:
         """The response of the sensor over that of the reference, as far as known."""
-        return self.recursion.response
+        return self.state.response
 
-    def _summary(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Summary:
-        return Summary.of(window, day, lag_s, temperature_degc, self.recursion.reference, self.recursion.motion_to_hz)
+    def _record(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Record:
+        return Record.of(window, day, lag_s, temperature_degc, self.state.reference, self.state.motion_to_hz)
 
     def date_certificate(self, day: float, utc_ns: int) -> None:
         """Tell the state the date of the certificate of the reference in use. `utc_ns` is the UTC of `day`."""
         dated = self._beside[self._place].certificate.date
         before_s = None if dated is None else utc_ns * 1e-9 - dated.timestamp()
-        self.recursion.date_certificate(None if before_s is None else day - before_s / DAY_S)
+        self.state.date_certificate(None if before_s is None else day - before_s / DAY_S)
 
-    def after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> Recursion:
+    def after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> State:
         """The state once these windows, made with `lag_s` taken out, were taken."""
         self._tried = self._try(windows[0], day, lag_s, temperature_degc)
         trial = self._tried.after
         for window in windows[1:]:
-            _, trial = trial.with_window(self._summary(window, day, lag_s, temperature_degc))
+            _, trial = trial.with_window(self._record(window, day, lag_s, temperature_degc))
         return trial
 
     def contradicted(self, found: Found, day: float, lag_s: float) -> bool:
@@ -143,36 +174,34 @@ class Estimation:
             tried = self._tried_of(window, day, lag_s, temperature_degc)
         else:
             if anew.shifted:
-                self.lag_watch.shifted(self.recursion)
-                self.recursion = anew.base
+                self.lag_watch.shifted(self.state)
+                self.state = anew.base
                 self.gate.dismiss()  # windows held before were made with another lag
                 self._held = []
-            summary = self._summary(window, day, lag_s, temperature_degc)
-            tried = Tried(window.sums, summary, *self.recursion.with_window(summary, at_its_lag=True))
+            record = self._record(window, day, lag_s, temperature_degc)
+            tried = Tried(window.sums, record, *self.state.with_window(record, at_its_lag=True))
         self._tried = None
-        summary, innovation, trial = tried.summary, tried.innovation, tried.after
+        record, innovation, trial = tried.record, tried.innovation, tried.after
         candidate, confirm = trial.result(), self._channel.gate.confirm_windows
-        held = [*self._held, summary][-confirm:]
+        held = [*self._held, record][-confirm:]
         agree = len(held) == confirm and not self.lag_watch.beyond
-        stability = self._beside[self._place].certificate.stability_pct / 100.0
-        jump = jumped(self.recursion, held, stability, self.gate.limit) if agree else None
-        adopted, who = self._witnesses.judge(self.recursion, held, jump, self.gate.limit, self._place)
-        same = not self._held or any(held_one.reference == summary.reference for held_one in self._held)
+        adopted, who = confirmed(self.state, held, self._devices, self.gate.limit) if agree else (None, "")
+        same = not self._held or any(held_one.reference == record.reference for held_one in self._held)
         enough = trial.windows > 1 or window.stop_s - window.start_s >= LEAST_S
         evidence = Evidence(
             day * DAY_S, innovation.statistic, innovation.degrees_of_freedom, dismisses=same, enough=enough
         )
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
-            self.recursion = trial
+            self.state = trial
         elif decision.action == "adopt":
             assert adopted is not None
-            self.recursion = adopted
+            self.state = adopted
+            self.state.solve()
             self.drift.restart(innovation.information > 0.0)
             decision = replace(decision, reason=f"{decision.reason}{who}")
         kept = held if decision.action == "hold" else self._held
         self._held = kept[-self.gate.held :] if self.gate.held else []
-        self._witnesses.update(summary, taken=decision.action == "take", held=len(self._held))
         if self._explain_s is None and self._held:
             self._explain_s = evidence.t_s + self._channel.gate.explain_after_s
         drift: Sequence[DriftVerdict] = ()
@@ -181,16 +210,17 @@ class Estimation:
             if not self.gate.held:  # else it is for windows that agree to confirm it
                 self._follow()
         if decision.in_force:
-            self.in_force, self.law = self.recursion.result(), self.recursion.law()
-            self.residual_sd = self.recursion.residual_sd
+            self.in_force, self.law = self.state.result(), self.state.law()
+            self.residual_sd = self.state.residual_sd
         if decision.action == "hold":
             if decision.proposal is not None:
                 made = trial if decision.proposal is candidate else adopted
                 assert made is not None  # a proposal is one of the two
-                self._proposed = [*self._proposed, (decision.proposal, made.settled())][-PROPOSALS_KEPT:]
-            why = self.lag_watch.beyond or most_likely(innovation, self.recursion.scale)
+                proposal = Proposal(decision.proposal, *made.beyond(self.state), made.shares)
+                self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
+            why = self.lag_watch.beyond or most_likely(innovation, self.state.scale)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
-        news = self.lag_watch.taken(self.recursion) if decision.action in ("take", "adopt") else ""
+        news = self.lag_watch.taken(self.state) if decision.action in ("take", "adopt") else ""
         return Judged(decision, innovation, drift, news)
 
     def explain(self, now_s: float) -> str:
@@ -205,48 +235,54 @@ class Estimation:
         self._explain_s = now_s + self._channel.gate.explain_after_s
         if self.lag_watch.beyond:
             return f"the held windows show another lag: {self.lag_watch.beyond}"
-        jump, fixed = possible_jump(self.recursion, self._held), self._channel.fixed_mount
-        return explained(self.recursion, self._held, jump, self.gate.limit, fixed_mount=fixed)
+        jump, fixed = possible_jump(self.state, self._held), self._channel.fixed_mount
+        return explained(self.state, self._held, jump, self.gate.limit, fixed_mount=fixed)
 
     def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
         """The window tried on the state; what `after` did is not done again."""
         tried = self._tried
-        if tried is not None and tried.window_sums is window.sums and tried.summary.lag_s == lag_s:
+        if tried is not None and tried.window_sums is window.sums and tried.record.lag_s == lag_s:
             return tried
         return self._try(window, day, lag_s, temperature_degc)
 
     def _try(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
-        summary = self._summary(window, day, lag_s, temperature_degc)
-        return Tried(window.sums, summary, *self.recursion.with_window(summary))
+        record = self._record(window, day, lag_s, temperature_degc)
+        return Tried(window.sums, record, *self.state.with_window(record))
 
-    def maker_of(self, calibration: Calibration) -> Recursion:
-        """The state that made a proposal; that of the estimation for what is no proposal."""
-        same = (r for c, r in self._proposed if np.array_equal(c.covariance, calibration.covariance))
-        return next(same, self.recursion)
+    def shares_of(self, calibration: Calibration) -> Sequence[ReferenceShare]:
+        """What a calibration owes to the references, where that is known."""
+        if np.array_equal(self.state.covariance, calibration.covariance):
+            return self.state.shares
+        proposal = self._proposal_of(calibration)
+        return () if proposal is None else proposal.shares
+
+    def _proposal_of(self, calibration: Calibration) -> Proposal | None:
+        same = (p for p in self._proposed if np.array_equal(p.calibration.covariance, calibration.covariance))
+        return next(same, None)
 
     def accept(self, calibration: Calibration) -> None:
-        """An operator put a proposal in force. The state continues from the one that made the proposal."""
-        if (proposed := self.maker_of(calibration)) is not self.recursion:
-            self.recursion = proposed  # else the state has taken the windows of the proposal already
-            self.use(self._place)
+        """An operator put a proposal in force. The state takes its windows, after the steps that it supposed."""
+        if (proposal := self._proposal_of(calibration)) is not None:  # else the state has taken them already
+            self.state.take_also(proposal.records, proposal.steps)
             self.drift.restart(np.ones(12, dtype=bool))
         self._put_in_force(calibration)
 
-    def roll_back(self, calibration: Calibration) -> None:
-        """An operator put an earlier calibration in force. The state continues from it, if it differs from the state.
+    def roll_back(self, calibration: Calibration, day: float | None = None) -> None:
+        """An operator put an earlier calibration in force on a day; None is that of the newest window. The state
+        continues from it, if it differs from the state.
 
         How its errors depend on the references is not known any more, so that the state is less certain than it.
         """
-        now = self.recursion.result()
+        now = self.state.result()
         if not (
             np.array_equal(now.sensitivity, calibration.sensitivity) and np.array_equal(now.offset, calibration.offset)
         ):
-            self.recursion.put(calibration)
+            self.state.put(calibration, day)
             self.drift.restart(np.ones(12, dtype=bool))
         self._put_in_force(calibration)
 
     def _put_in_force(self, calibration: Calibration) -> None:
-        law = self.recursion.law()  # the dependence of S and Q on the temperature is that of the state
+        law = self.state.law()  # the dependence of S and Q on the temperature is that of the state
         mean, covariance = law.mean.copy(), law.covariance.copy()
         mean[:12] = np.append(calibration.sensitivity.ravel(), calibration.offset)
         covariance[:12, :12] = calibration.covariance
@@ -255,47 +291,47 @@ class Estimation:
         self._held, self._proposed = [], []
 
     def meet(self, reference: str, calibrated: str, sensitivity: float) -> bool:
-        """The reference that is connected now, and its certificate (see Recursion.meet).
+        """The reference that is connected now, and its certificate (see State.meet).
 
         Held windows of another reference are dropped. Returns whether the calibration in force changed.
         """
-        before, follows = self.recursion.reference, self._follows_state()
-        changed = self.recursion.meet(reference, calibrated, sensitivity)
-        if before not in ("", self.recursion.reference):
+        before, follows = self.state.reference, self._follows_state()
+        changed = self.state.meet(reference, calibrated, sensitivity)
+        if before not in ("", self.state.reference):
             self.gate.dismiss()
             self.lag_watch.forget()
             self._held, self._proposed = [], []
         return changed and follows and self._update_in_force()
 
     def restate(self, gravity_mps2: tuple[float, float] | None, *, remounted: bool, size: float | None = None) -> bool:
-        """After `load` of a state that was made with another configuration: see Recursion.restate.
+        """After `load` of a state that was made with another configuration: see State.restate.
 
         `remounted`: the stated poses changed. `size`: other filters are known, and those of the sensor pass so many
         times what they did. Returns whether the calibration in force changed.
         """
         follows = self._follows_state()
         if size is not None:
-            u_S = (size - 1.0) * self.recursion.result().sensitivity.ravel()
+            u_S = (size - 1.0) * self.state.result().sensitivity.ravel()
             for place in range(len(self._beside)):
                 self.use(place)
-                self.recursion.loosen(np.append(u_S, np.zeros(3)), line=True, another_filter=True)
+                self.state.step(self.state.changes(np.append(u_S, np.zeros(3)), line=True, another_filter=True))
                 u_S = np.zeros(9)
             self.use(0)
             self._held = []
         if remounted:
-            self.recursion.remount(of_reference=False)
+            self.state.remount(of_reference=False)
             self._held = []
-        changed = self.recursion.restate(gravity_mps2) or size is not None
+        changed = self.state.restate(gravity_mps2) or size is not None
         return changed and follows and self._update_in_force()
 
     def _follows_state(self) -> bool:
         """Whether the calibration in force is that of the state, but for rounding."""
-        now, u = self.recursion.result(), self.in_force.standard_uncertainty
+        now, u = self.state.result(), self.in_force.standard_uncertainty
         moved = np.append(now.sensitivity - self.in_force.sensitivity, now.offset - self.in_force.offset)
         return self.gate.calibrated and bool(np.all(np.abs([moved, now.standard_uncertainty - u]) <= SAME * u))
 
     def _update_in_force(self) -> bool:
-        self.in_force, self.law = self.recursion.result(), self.recursion.law()
+        self.in_force, self.law = self.state.result(), self.state.law()
         return True
 
     def _follow(self) -> None:
@@ -312,43 +348,40 @@ class Estimation:
                 rate[k] = np.hypot(verdict.rate, verdict.u_rate)
             loose[k] = np.hypot(verdict.change, verdict.u_change)
         if loose.any():
-            leaning_rad, another_filter = tilt_rad(loose[9:], self.recursion.scale), bool(loose[:9].any())
-            self.recursion.loosen(loose, leaning_rad, u_rate=rate, another_filter=another_filter)
+            leaning_rad, another_filter = tilt_rad(loose[9:], self.state.scale), bool(loose[:9].any())
+            self.state.step(self.state.changes(loose, leaning_rad, u_rate=rate, another_filter=another_filter))
             self.drift.restart(loose > 0.0)
 
     # --- state
 
-    def _loaded(self, state: dict[str, Any]) -> Recursion:
-        loaded = self.recursion.copy()
-        loaded.load(state)
-        return loaded
-
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
         return {
-            "recursion": self.recursion.snapshot(),
+            "state": self.state.snapshot(),
             "gate": self.gate.snapshot(),
             "drift": self.drift.snapshot(),
-            "held": [summary.snapshot() for summary in self._held],
-            "proposed": [{"calibration": fields_of(c), "recursion": r.snapshot()} for c, r in self._proposed],
+            "held": [record.snapshot() for record in self._held],
+            "proposed": [proposal.snapshot() for proposal in self._proposed],
             "in_force": fields_of(self.in_force),
             "law": {name: getattr(self.law, name) for name in Law.__slots__},
             "residual_sd": self.residual_sd,
             "lag_watches": [watch.snapshot() for watch in self._lag_watches],
-            "witnesses": self._witnesses.snapshot(),
             "explain_s": self._explain_s,
         }
 
     def load(self, state: dict[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
-        self.recursion.load(state["recursion"])
+        if state["state"] is None:  # of a version before 8
+            self.gate.load(state["gate"])
+            self.roll_back(Calibration(**state["in_force"]), state["day"])
+            return
+        self.state.load(state["state"])
         self.gate.load(state["gate"])
         self.drift.load(state["drift"])
-        self._held = [Summary.load(summary) for summary in state["held"]]
-        self._proposed = [(Calibration(**p["calibration"]), self._loaded(p["recursion"])) for p in state["proposed"]]
+        self._held = [Record.load(record) for record in state["held"]]
+        self._proposed = [Proposal.load(proposal) for proposal in state["proposed"]]
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
         self.residual_sd = np.array(state["residual_sd"])
         self._explain_s = state["explain_s"]
-        self._witnesses.load(state["witnesses"])
         for watch, kept in zip(self._lag_watches, state["lag_watches"], strict=False):
             watch.load(kept)

@@ -1,6 +1,6 @@
-"""What explains the windows that stay held: each line of the uncertainty budget is set free in turn, in a copy.
+"""What explains the windows that stay held: each line of the uncertainty budget is set free in turn, before them.
 
-The held windows are then taken one after the other. The sum of their chi-squared tells how well they agree with the
+The whole is then solved anew with the held windows. By how much chi-squared grows tells how well they agree with the
 state if only this line is other than the state knows.
 """
 
@@ -15,8 +15,8 @@ from agent.core.gate import Limit
 from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
 from calib.estimate.quantities import OFFSET, RESPONSE, Kind, Quantity
-from calib.estimate.recursion import Recursion
-from calib.estimate.window_rows import Summary
+from calib.estimate.record import Record
+from calib.estimate.state import State
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array
 
@@ -53,43 +53,47 @@ class Explanation:
         return self.chi2 + AN_UNKNOWN * len(self.members)
 
 
-def explained(recursion: Recursion, held: Sequence[Summary], jump: Array, limit: Limit, *, fixed_mount: bool) -> str:
+def explained(state: State, held: Sequence[Record], jump: Array, limit: Limit, *, fixed_mount: bool) -> str:
     """The explanation that fits the held windows best, for an operator.
 
     `jump` (12,) sets S and Q free, 0 where the windows tell nothing of them.
     """
-    before, freedom, _ = _taken(recursion, held)
-    sound = limit(freedom)
+    alone = state.chi2_beside(held)
+    before = state.after(held, {}).chi2 - alone
+    sound = limit(sum(record.rows for record in held))
     said = (
         f"{len(held)} held windows contradict the state: chi-squared {before:.0f}, {sound:.0f} at most if it is right."
     )
     found = sorted(
-        (_with(recursion, held, jump, line, members) for line, members in _lines(recursion, jump, fixed_mount).items()),
+        (_with(state, held, jump, line, members, alone) for line, members in _lines(state, jump, fixed_mount).items()),
         key=lambda e: e.score,
     )
     if not found or before < WORTH * found[0].chi2:
         return f"{said} No known explanation fits them. Compare devices and mount with the configuration"
-    best = found[0]
+    # Of those that fit alike, the one with the fewest unknowns: a mount that turned is also a change of all S.
+    best = min((e for e in found if e.score < found[0].score + AS_WELL), key=lambda e: len(e.members))
     fits = "Best fits" if best.chi2 <= sound else "Nearest, though not within what chance allows, is"
     alike = [
-        _told(e, recursion.scale) for e in found[1:] if e.score < best.score + AS_WELL and not best.members < e.members
+        _told(e, state.scale)
+        for e in found
+        if e is not best and e.score < found[0].score + AS_WELL and not best.members < e.members
     ]
     others = f" As well fits: {'; '.join(alike)}." if alike else ""
     return (
-        f"{said} {fits} {_told(best, recursion.scale)}: chi-squared {best.chi2:.0f}, {before / best.chi2:.3g} times "
-        f"smaller.{others} {_remedy(best, recursion.scale, fixed_mount)}"
+        f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}, {before / best.chi2:.3g} times "
+        f"smaller.{others} {_remedy(best, state.scale, fixed_mount)}"
     )
 
 
-def _lines(recursion: Recursion, jump: Array, fixed_mount: bool) -> dict[str, list[int]]:
+def _lines(state: State, jump: Array, fixed_mount: bool) -> dict[str, list[int]]:
     """S, Q, and each line of the budget that the configuration states: which unknowns it has.
 
     At a fixed mount the mean output stands in the place of Q; the data cannot tell a lean of the mount from it.
     """
-    quantities, lines = recursion.quantities, dict[str, list[int]]()
+    quantities, lines, own = state.quantities, dict[str, list[int]](), {quantity.key for quantity in state.present}
     for k, quantity in enumerate(quantities):
         kind = quantity.kind
-        if quantity.owner not in ("", recursion.reference) or quantity.first:
+        if quantity.key not in own:
             continue
         stated = kind.source and _settings(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
         stated = stated or kind is RESPONSE
@@ -102,36 +106,28 @@ def _lines(recursion: Recursion, jump: Array, fixed_mount: bool) -> dict[str, li
     return lines
 
 
-def _with(recursion: Recursion, held: Sequence[Summary], jump: Array, line: str, members: Sequence[int]) -> Explanation:
-    quantities = recursion.quantities
+def _with(
+    state: State, held: Sequence[Record], jump: Array, line: str, members: Sequence[int], alone: float
+) -> Explanation:
+    quantities = state.quantities
     u = np.zeros(len(quantities))
     for k in members:
         kind = quantities[k].kind
         u[k] = jump[k] if k < len(jump) else RESPONSE_U if kind is RESPONSE else FREE[kind.unit]
-    trial = recursion.copy()
-    trial.loosen(u)
-    chi2, _, after = _taken(trial, held)
+    after = state.after(held, state.changes(u))
+    chi2 = after.chi2 - alone
     if quantities[members[0]].kind is RESPONSE:
-        hz, change = after.response_change(recursion)
+        hz, change = after.response_change(state)
         return Explanation(f"response at {hz:.3g} Hz", chi2, frozenset(members), quantities[members[0]], change)
     own = [quantities[k] for k in members if quantities[k].kind is quantities[members[0]].kind]
-    moved = [_moved(recursion, after, quantity) for quantity in own]
+    moved = [_moved(state, after, quantity) for quantity in own]
     most = int(np.argmax([abs(change) / u_after for change, u_after in moved]))
     return Explanation(line, chi2, frozenset(members), own[most], moved[most][0])
 
 
-def _moved(before: Recursion, after: Recursion, quantity: Quantity) -> tuple[float, float]:
+def _moved(before: State, after: State, quantity: Quantity) -> tuple[float, float]:
     value, u = after.quantity(quantity.key)
     return value - before.quantity(quantity.key)[0], max(u, np.finfo(float).tiny)
-
-
-def _taken(recursion: Recursion, held: Sequence[Summary]) -> tuple[float, int, Recursion]:
-    """Chi-squared of the windows, taken one after the other, their degrees of freedom, and the state after them."""
-    chi2, freedom = 0.0, 0
-    for summary in held:
-        told, recursion = recursion.with_window(summary)
-        chi2, freedom = chi2 + told.statistic, freedom + told.degrees_of_freedom
-    return chi2, freedom, recursion
 
 
 def _told(explanation: Explanation, scale: float) -> str:

@@ -106,6 +106,9 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
         return Kept(Estimation(filters.channel, nominal), None, 0.0, 0, reason)
     if "estimation" not in state:
         return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, "nothing else was left")
+    if isinstance(held := state["estimation"], dict) and held.get("state", held) is None:
+        why = "an earlier version of the program kept it"
+        return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, why)
     try:
         were = DriverFilters(_as_before(state["basis"], configured))
         were.load(state["filters"])
@@ -115,12 +118,12 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
         if wrong := _made_otherwise(changed, state["basis"], configured):
             reason = f"begun again from the prior: windows were made with other settings: {', '.join(wrong)}"
             return Kept(fresh, None, day, t_utc_ns, reason)
-        stated = fresh.recursion.result()
+        stated = fresh.state.result()
         fresh.load(state["estimation"])
         if "prior" in changed and (beyond := fresh.gate.anchor_at(stated, fresh.in_force)):
             reason = f"begun again from the prior: the calibration in force contradicts the changed prior: {beyond}"
             return Kept(Estimation(filters.channel, nominal), None, day, t_utc_ns, reason)
-        size = _size(were.channel, filters.channel, fresh.recursion.reference_frequency_hz)
+        size = _size(were.channel, filters.channel, fresh.state.reference_frequency_hz)
         gravity = _gravity(changed, state["basis"], configured)
         moved = fresh.restate(gravity, remounted=bool(MOUNT & changed), size=size)
     except MALFORMED as error:
@@ -155,7 +158,7 @@ def _from_in_force(
         if refused:
             reason = f"begun again from the prior: {why}; {refused}"
             return Kept(Estimation(channel, nominal), None, day, t_utc_ns, reason)
-    fresh.roll_back(calibration_of(in_force))
+    fresh.roll_back(calibration_of(in_force), day)
     return Kept(fresh, in_force, day, t_utc_ns, f"begun again from the calibration in force: {why}")
 
 
@@ -221,9 +224,9 @@ def restated(
     """
     fresh = Estimation(channel, nominal)
     fresh.load(estimation.snapshot())
-    if not fresh.recursion.windows:
+    if not fresh.state.windows:
         return fresh, told, fresh.restate(None, remounted=False)
-    size = _size(before, channel, fresh.recursion.reference_frequency_hz)
+    size = _size(before, channel, fresh.state.reference_frequency_hz)
     changed = fresh.restate(None, remounted=False, size=size)
     return fresh, "; ".join(filter(None, (told, OTHER_FILTERS))), changed
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,8 +22,9 @@ from agent.core.events import (
 )
 from calib.estimate.drift import DriftVerdict
 from calib.estimate.quantities import MAIN_TEMPERATURE, RATES, offset_temperature
-from calib.estimate.recursion import Recursion
+from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import ResponseTold
+from calib.estimate.state import State
 from calib.model import Array, Calibration, Window
 
 UNCERTAINTY = "combined"
@@ -43,41 +44,42 @@ class Source:
 def calibration_update(
     source: Source,
     calibration: Calibration,
-    recursion: Recursion,
-    made_by: Recursion,
+    state: State,
+    shares: Sequence[ReferenceShare],
     certificate_of: Callable[[str], Certificate | None],
 ) -> CalibrationUpdate:
     """S and Q with temperature coefficients, drift rates and the number of windows.
 
-    `made_by` is the state that made the calibration, where that is known: what S and Q owe to the references is stated
-    only if this state still has these S and Q. `certificate_of` a reference: None if it is not connected.
+    `shares`: what S and Q owe to the references, empty where that is not known. `certificate_of` a reference: None if
+    it is not connected.
     """
-    known = np.array_equal(made_by.covariance, calibration.covariance)
-    powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in recursion.names]
-    by_power = [_both(recursion, offset_temperature(k)) for k in powers]
-    S_temperature = _both(recursion, MAIN_TEMPERATURE) if MAIN_TEMPERATURE[0] in recursion.names else ([], [])
-    rate, u_rate = _both(recursion, RATES)
-    low, high = recursion.temperature_range_degc
+    powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in state.names]
+    by_power = [_both(state, offset_temperature(k)) for k in powers]
+    S_temperature = _both(state, MAIN_TEMPERATURE) if MAIN_TEMPERATURE[0] in state.names else ([], [])
+    rate, u_rate = _both(state, RATES)
+    low, high = state.temperature_range_degc
     return CalibrationUpdate(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns,
         sensitivity=calibration.sensitivity.tolist(), offset=calibration.offset.tolist(),
         standard_uncertainty=calibration.standard_uncertainty.tolist(), covariance=calibration.covariance.tolist(),
-        coverage_factor=recursion.coverage_factor, determined=calibration.determined.tolist(),
-        method=calibration.method, uncertainty_kind=UNCERTAINTY, windows=recursion.windows,
-        residual_sd=recursion.residual_sd.tolist(), output_unit=source.output_unit, identity=source.identity,
-        reference_temperature_degc=recursion.reference_temperature_degc,
+        coverage_factor=state.coverage_factor, determined=calibration.determined.tolist(),
+        method=calibration.method, uncertainty_kind=UNCERTAINTY, windows=state.windows,
+        residual_sd=state.residual_sd.tolist(), output_unit=source.output_unit, identity=source.identity,
+        reference_temperature_degc=state.reference_temperature_degc,
         temperature_low_degc=low, temperature_high_degc=high,
         offset_temperature=[value for value, _ in by_power], u_offset_temperature=[u for _, u in by_power],
         sensitivity_temperature=S_temperature[0], u_sensitivity_temperature=S_temperature[1],
-        offset_rate=rate, u_offset_rate=u_rate, references=[name for name in recursion.references if name],
-        reference_frequency_hz=recursion.reference_frequency_hz, **_over_frequency(recursion.response_told),
-        shared_errors=_shared_errors(made_by, certificate_of) if known else [],
+        offset_rate=rate, u_offset_rate=u_rate, references=[name for name in state.references if name],
+        reference_frequency_hz=state.reference_frequency_hz, **_over_frequency(state.response_told),
+        shared_errors=_shared_errors(shares, certificate_of),
     )  # fmt: skip
 
 
-def _shared_errors(recursion: Recursion, certificate_of: Callable[[str], Certificate | None]) -> list[SharedError]:
+def _shared_errors(
+    shares: Sequence[ReferenceShare], certificate_of: Callable[[str], Certificate | None]
+) -> list[SharedError]:
     found = []
-    for share in recursion.shares:
+    for share in shares:
         certificate = certificate_of(share.reference)
         told = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
         found.append(SharedError(**share.told(*told)))
@@ -164,6 +166,6 @@ def status_change(source: Source, status: str, before: str, reason: str) -> Stat
     )  # fmt: skip
 
 
-def _both(recursion: Recursion, names: tuple[str, str, str]) -> tuple[list[float], list[float]]:
-    found: Array = np.array([recursion.quantity(name) for name in names])
+def _both(state: State, names: tuple[str, str, str]) -> tuple[list[float], list[float]]:
+    found: Array = np.array([state.quantity(name) for name in names])
     return found[:, 0].tolist(), found[:, 1].tolist()

@@ -12,7 +12,7 @@ import numpy as np
 from agent.config import Channel
 from agent.core.schedule import Piece, Stance, pieces
 from agent.core.stream import UNCOUNTED, DeviceStream
-from calib.estimate.recursion import Recursion
+from calib.estimate.state import State
 from calib.excitation.placing import Knowledge, Placed, clamp_angles, mean_output, nearest_stop
 from calib.excitation.standing import KEPT, MEAN_S, Standing
 from calib.excitation.window_verdict import Limits
@@ -126,7 +126,7 @@ class FoundPositions:
 
     # --- how it stands
 
-    def place(self, piece: Piece, cut: Samples | None, known: Recursion, day: float) -> Placed:
+    def place(self, piece: Piece, cut: Samples | None, known: State, day: float) -> Placed:
         """How the sensor stands in a piece, by the mean of its samples `cut` and what is known of it on that day."""
         if piece.pose is not OPEN:
             return Placed(piece.pose, "", {})

@@ -7,9 +7,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from agent.core.migrations import MIGRATIONS
+from agent.core.earlier import brought_up
 
-VERSION = 7
+VERSION = 8
 _ARRAY = 1  # msgpack extension code for a numpy array
 
 
@@ -22,7 +22,7 @@ def pack(state: dict[str, Any]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, Any]:
-    """The state in the bytes of `pack`. A state of an older version is converted to the present one.
+    """The state in the bytes of `pack`. Of a version before 8, what agent.core.earlier leaves of it.
 
     Raises ValueError if the bytes are no snapshot, or if this program does not know their version.
     """
@@ -31,17 +31,15 @@ def unpack(data: bytes) -> dict[str, Any]:
         version, state = held["version"], held["state"]
     except (msgspec.DecodeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"not a snapshot: {error}") from None
-    if not isinstance(state, dict) or (version != VERSION and version not in MIGRATIONS):
-        raise ValueError(
-            f"the snapshot has version {version}, but this program reads versions {min(MIGRATIONS)} to {VERSION} only"
-        )
-    try:
-        for older in range(version, VERSION):
-            MIGRATIONS[older](state)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(
-            f"the snapshot has version {version} and cannot be converted to version {VERSION}: {error!r}"
-        ) from None
+    if not isinstance(state, dict) or not isinstance(version, int) or not 1 <= version <= VERSION:
+        raise ValueError(f"the snapshot has version {version}, but this program reads versions 1 to {VERSION} only")
+    if version < VERSION:
+        try:
+            brought_up(version, state)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"the snapshot has version {version} and cannot be brought up to version {VERSION}: {error!r}"
+            ) from None
     return state
 
 

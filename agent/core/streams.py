@@ -96,7 +96,7 @@ class Streams:
     def look_where(self, block: SampleBlock, estimation: Estimation) -> None:
         """Where nobody told how the sensor stands, gravity in its newest block may."""
         if self._finder is not None:
-            self._finder.update(block, self._sensor, estimation.recursion.scale)
+            self._finder.update(block, self._sensor, estimation.state.scale)
 
     def forget_sensor(self) -> None:
         """Another device takes the sensor's place: samples of the one before are nothing to it."""
@@ -266,7 +266,7 @@ class Streams:
         if self._finder is None or estimation is None:
             return Placed(piece.pose, "", {})
         cut = self._sensor.cut(first_s + piece.start_s, first_s + piece.stop_s)
-        return self._finder.place(piece, cut, estimation.recursion, day)
+        return self._finder.place(piece, cut, estimation.state, day)
 
     def _found(
         self, piece: Piece, first_s: float, day: float, estimation: Estimation | None
@@ -277,7 +277,7 @@ class Streams:
             lag_s = 0.0 if estimation is None else estimation.lag_s
             return self._make(piece, first_s, FLAT, np.inf, lag_s), lag_s, None
         lag_s, response = estimation.lag_s, estimation.response
-        trial, known = estimation.recursion, estimation.recursion.response_is_known
+        trial, known = estimation.state, estimation.state.response_is_known
 
         def lag_of(found: Found, lag_s: float) -> float:
             nonlocal trial
@@ -286,7 +286,7 @@ class Streams:
             return lag_s if known and estimation.contradicted(found, day, lag_s) else trial.lag_s
 
         for _ in range(RESPONSE_TURNS):
-            make = partial(self._make, piece, first_s, response, estimation.recursion.motion_to_hz)
+            make = partial(self._make, piece, first_s, response, estimation.state.motion_to_hz)
             found, lag_s = without_lag(lag_s, make, lambda found: found.used, lag_of)
             if known or not found.used or trial.response_is(response):
                 break
@@ -295,7 +295,7 @@ class Streams:
             return found.refused(UNSETTLED), lag_s, None
         if not estimation.contradicted(found, day, lag_s):
             return found, lag_s, None
-        anew = estimation.lag_watch.search(estimation.recursion, make, found.windows, day)
+        anew = estimation.lag_watch.search(estimation.state, make, found.windows, day)
         if anew is not None and not anew.beyond:
             return anew.found, anew.lag_s, anew
         return found.because(estimation.lag_watch.beyond), lag_s, None

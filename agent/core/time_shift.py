@@ -18,8 +18,8 @@ from agent.core.gate import Limit
 from agent.core.windows import Found
 from calib.estimate.lag_search import starts, without_lag
 from calib.estimate.nuisances import Priors
-from calib.estimate.recursion import Recursion
-from calib.estimate.window_rows import Summary
+from calib.estimate.record import Record
+from calib.estimate.state import State
 from calib.model import Window
 
 FOUND_WITHIN_U = 4.0  # stated standard uncertainties; one sound lag in 16,000 is beyond
@@ -38,7 +38,7 @@ class Anew:
 
     found: Found
     lag_s: float
-    base: Recursion
+    base: State
     shifted: bool
     beyond: str = ""
 
@@ -76,42 +76,42 @@ class LagWatch:
         self.beyond = ""  # why the lag that explains the newest pieces must not be used
 
     def search(
-        self, recursion: Recursion, make: Callable[[float], Found], contradicting: Sequence[Window], day: float
+        self, state: State, make: Callable[[float], Found], contradicting: Sequence[Window], day: float
     ) -> Anew | None:
         """See `search`. It costs as much as some ten windows: if it fails, it is made again only for the contradicting
         pieces number 1, 2, 4, 8 and so on since the last window that was taken."""
         self._unexplained += 1
         if self._unexplained & (self._unexplained - 1):
             return None
-        anew = search(recursion, self._priors, self._limit, make, contradicting, day)
+        anew = search(state, self._priors, self._limit, make, contradicting, day)
         self.beyond = "" if anew is None else anew.beyond
         return anew
 
-    def began(self, recursion: Recursion, device: str) -> None:
+    def began(self, state: State, device: str) -> None:
         """A device or its line began anew: it may be late by another time from now on, as far as stated."""
-        if "lag" not in recursion.names:
+        if "lag" not in state.names:
             return
         if self._line is None:
-            self.shifted(recursion)
-            recursion.loosen(np.zeros(12), line=True)
+            self.shifted(state)
+            state.step(state.changes(np.zeros(12), line=True))
         if self._line is not None and device not in self._line.devices:
             self._line.devices.append(device)
 
-    def shifted(self, recursion: Recursion) -> None:
-        """The lag is another now than in `recursion`."""
-        self._line = self._line or Line(*recursion.quantity("lag"), [])
+    def shifted(self, state: State) -> None:
+        """The lag is another now than in `state`."""
+        self._line = self._line or Line(*state.quantity("lag"), [])
 
     def forget(self) -> None:
         """Another reference has a lag of its own."""
         self._line, self._unexplained, self.beyond = None, 0, ""
 
-    def taken(self, recursion: Recursion) -> str:
-        """`recursion` has taken a window: the news of a shift for the operator, or ""."""
+    def taken(self, state: State) -> str:
+        """`state` has taken a window: the news of a shift for the operator, or ""."""
         line = self._line
         self.forget()
         if line is None or self._channel.reference is None:
             return ""
-        return line.told(*recursion.quantity("lag"), self._channel.sensor, self._channel.reference)
+        return line.told(*state.quantity("lag"), self._channel.sensor, self._channel.reference)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
@@ -125,7 +125,7 @@ class LagWatch:
 
 
 def search(
-    recursion: Recursion,
+    state: State,
     priors: Priors,
     limit: Limit,
     make: Callable[[float], Found],
@@ -136,8 +136,8 @@ def search(
 
     `make(lag_s)` makes the windows again with this lag taken out; `contradicting` are those made before.
     """
-    loose = recursion.copy()
-    loose.loosen(np.zeros(12), line=True)
+    loose = state.copy()
+    loose.step(loose.changes(np.zeros(12), line=True))
     mean_s, within_s = priors.lag_at_s, FOUND_WITHIN_U * priors.lag_s
     looked_s = max(2.0 * within_s, LOOKED_WITHIN_S)
     stated = starts(mean_s - within_s, mean_s + within_s, contradicting)
@@ -145,54 +145,54 @@ def search(
     beyond += starts(mean_s + within_s, mean_s + looked_s, contradicting)
     for lags_s in (stated, beyond):
         found, lag_s = _best(loose, make, lags_s, day)
-        for base in (recursion, loose):
+        for base in (state, loose):
             if not _explains(base, found, lag_s, day, limit):
                 continue
             shifted = base is loose
-            if shifted and not _decisive(recursion, loose, found, lag_s, day, limit):
+            if shifted and not _decisive(state, loose, found, lag_s, day, limit):
                 break
             off_s = abs(lag_s - mean_s)
             return Anew(found, lag_s, base, shifted, "" if off_s <= within_s else _too_far(lag_s, mean_s, priors.lag_s))
     return None
 
 
-def _best(loose: Recursion, make: Callable[[float], Found], lags_s: Sequence[float], day: float) -> tuple[Found, float]:
+def _best(loose: State, make: Callable[[float], Found], lags_s: Sequence[float], day: float) -> tuple[Found, float]:
     """The windows and the lag to which the best of the starts `lags_s` leads."""
 
     def misfit(lag_s: float) -> tuple[int, float]:
-        told = [loose.innovation(s, at_its_lag=True) for s in _summaries(make(lag_s), day, lag_s, loose)]
+        told = [loose.innovation(s, at_its_lag=True) for s in _records(make(lag_s), day, lag_s, loose)]
         return -len(told), sum(t.statistic for t in told)
 
     def lag_after(found: Found, lag_s: float) -> float:
-        first, *others = _summaries(found, day, lag_s, loose)
+        first, *others = _records(found, day, lag_s, loose)
         trial = loose.with_window(first, at_its_lag=True)[1]
-        for summary in others:
-            trial = trial.with_window(summary)[1]
+        for record in others:
+            trial = trial.with_window(record)[1]
         return trial.lag_s
 
     return without_lag(min(lags_s, key=misfit), make, lambda found: found.used, lag_after)
 
 
-def _explains(base: Recursion, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
+def _explains(base: State, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
     """Whether the windows, taken one after the other, are all consistent with the state; at least one is used."""
-    trial, summaries = base, _summaries(found, day, lag_s, base)
-    for k, summary in enumerate(summaries):
-        told, trial = trial.with_window(summary, at_its_lag=k == 0)
+    trial, records = base, _records(found, day, lag_s, base)
+    for k, record in enumerate(records):
+        told, trial = trial.with_window(record, at_its_lag=k == 0)
         if told.statistic > limit(told.degrees_of_freedom):
             return False
-    return bool(summaries)
+    return bool(records)
 
 
-def _decisive(recursion: Recursion, loose: Recursion, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
+def _decisive(state: State, loose: State, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
     """Whether the other lag alone makes the difference: chi-squared falls by more than one unknown does by chance."""
-    first = _summaries(found, day, lag_s, loose)[0]
-    tight = recursion.innovation(first, at_its_lag=True).statistic
+    first = _records(found, day, lag_s, loose)[0]
+    tight = state.innovation(first, at_its_lag=True).statistic
     return tight - loose.innovation(first, at_its_lag=True).statistic > limit(1.0)
 
 
-def _summaries(found: Found, day: float, lag_s: float, state: Recursion) -> list[Summary]:
+def _records(found: Found, day: float, lag_s: float, state: State) -> list[Record]:
     told = lag_s, found.temperature_degc, state.reference, state.motion_to_hz
-    return [Summary.of(window, day, *told) for window in found.used]
+    return [Record.of(window, day, *told) for window in found.used]
 
 
 def _too_far(lag_s: float, mean_s: float, u_s: float) -> str:

@@ -18,8 +18,8 @@ from calib.estimate.budget import Budget, budget
 from calib.estimate.condense import Condensed, condense, effective
 from calib.estimate.determined import determined
 from calib.estimate.equations import Equations
-from calib.estimate.fixed_mount import mean_input, never_turned
 from calib.estimate.gauss_newton import Flags, Solution, slope_residuals, solve
+from calib.estimate.never_turned import mean_input, never_turned
 from calib.estimate.nuisances import Applied, Nuisances, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare, share_after

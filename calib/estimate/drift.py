@@ -41,7 +41,7 @@ class DriftVerdict:
     """The verdict on one parameter of calib.model.PARAMETERS.
 
     `change`, `u_change`: size of a step, or how far a drift has come since its onset, in the parameter's unit; `rate`,
-    `u_rate`: rate of a drift per day. All are the part that the state of the recursion has not followed yet. `onset_s`
+    `u_rate`: rate of a drift per day. All are the part that the state has not followed yet. `onset_s`
     is the time at which the step or the drift began. A value that does not apply is NaN. `statistic` and `threshold`
     are those of the test. `reason` is empty if the parameter is stable.
     """

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.estimate.joint_state import JointState
-from calib.estimate.window_rows import Rows
 from calib.model import Array
 
 TELLS = 1e-6  # least information of a window on a parameter, relative to that of the state
@@ -29,16 +27,17 @@ class Innovation:
     information: Array
 
 
-def innovation(rows: Rows, state: JointState, at: Array) -> Innovation:
-    """The innovation of a window's rows against the state's mean; `at` (N,) are the values at which they are linear."""
-    residual = rows.residual + rows.jacobian @ (at - state.mean)
-    a = rows.jacobian @ state.factor
+def innovation(rows: Array, d: Array, factor: Array) -> Innovation:
+    """The innovation of a window's rows (r, N + 1) against deviations d (N,) with this factor (N, N) of covariance."""
+    jacobian = rows[:, :-1]
+    residual = rows[:, -1] - jacobian @ d
+    a = jacobian @ factor
     covariance = a @ a.T + np.eye(len(a))
-    own = rows.jacobian[:, :12]
+    own = jacobian[:, :12]
     weighed = np.linalg.solve(covariance, np.column_stack([residual, own]))
     information = np.einsum("rp,rp->p", own, weighed[:, 1:])
-    tells = information * state.variance[:12] > TELLS
+    variance = np.einsum("ij,ij->i", factor[:12], factor[:12])
+    tells = information * variance > TELLS
     root = np.sqrt(np.where(tells, information, 1.0))
     score = np.where(tells, own.T @ weighed[:, 0] / root, np.nan)
-    statistic = float(residual @ weighed[:, 0])
-    return Innovation(statistic, len(a), score, np.where(tells, information, 0.0))
+    return Innovation(float(residual @ weighed[:, 0]), len(a), score, np.where(tells, information, 0.0))

@@ -9,16 +9,15 @@ from typing import Any, Self
 
 import numpy as np
 
-from calib.estimate.condense import Condensed, mean_frequency_hz
 from calib.estimate.deviations import Deviations, LeftOpen
-from calib.estimate.joint_state import JointState
+from calib.estimate.estimate import Now
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE, Quantity
+from calib.estimate.record import WIDER, Record
 from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
 from calib.model import Array
 from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, attenuating, by_term, in_units
 
-WIDER = 1.1  # later windows may move so much faster than the first one
 KNOWN = 0.03  # standard uncertainty of ln h
 LEFT_U = 1.0  # standard uncertainties of ln h that may be left in a window
 SURELY = 4.0  # standard uncertainties
@@ -52,32 +51,26 @@ class OverFrequency:
             priors = priors.at_one_frequency(self.first_hz, self.late_s)
         return priors if self.motion_hz is None else priors.with_response(self.motion_hz, self.to_hz)
 
-    def begun(self, motion_hz: tuple[float, float] | None, data: Condensed, lag_s: float) -> Self:
-        """The same when a window comes whose motion is in the band `motion_hz`, or has one frequency (None).
-
-        `data` are the window's; `lag_s` was taken out of it.
-        """
+    def begun(self, record: Record) -> Self:
+        """The same when a window comes: its motion is in a band, or has one frequency."""
         if self.motion_hz is not None:
             return self
-        moving_hz = mean_frequency_hz(data)
-        if motion_hz is not None:
-            return replace(self, motion_hz=motion_hz, first_hz=self.first_hz or moving_hz)
-        if self.late_s is None and moving_hz:
-            return replace(self, first_hz=moving_hz, late_s=lag_s)
+        if record.motion_hz is not None:
+            return replace(self, motion_hz=record.motion_hz, first_hz=self.first_hz or record.mean_hz)
+        if self.late_s is None and record.mean_hz:
+            return replace(self, first_hz=record.mean_hz, late_s=record.lag_s)
         return self
 
-    def taken(self, data: Condensed) -> Self:
-        """After a window with these data."""
-        if (bands := data.bands) is None:
-            return self
-        deviations, left_open = self.deviations.plus(bands.deviations), self.left_open.plus(bands.left_open)
+    def taken(self, record: Record) -> Self:
+        """After a window."""
+        deviations, left_open = self.deviations.plus(record.deviations), self.left_open.plus(record.left_open)
         return replace(self, deviations=deviations, left_open=left_open)
 
     def reference_hz(self, priors: Priors) -> float:
         """The frequency at which S holds; 0 if nothing moved yet."""
         return self.stated(priors).reference_frequency_hz or self.first_hz
 
-    def response(self, state: JointState, reference: str, taken: tuple[float, ...] = ()) -> Response:
+    def response(self, state: Now, reference: str, taken: tuple[float, ...] = ()) -> Response:
         """The response of the sensor over that of a reference: what the front end is to take out.
 
         `taken`: the terms that were taken out of the window before. They stay while they are right but for a part of
@@ -92,12 +85,12 @@ class OverFrequency:
         found = Response(tuple((state.mean[own] * in_units(self.to_hz)).tolist()), self.to_hz).rounded
         return FLAT if found.is_flat else found
 
-    def is_known(self, state: JointState, reference: str) -> bool:
+    def is_known(self, state: Now, reference: str) -> bool:
         """Whether windows have told the response beside a reference: one more cannot change it much."""
         own = terms_of(state, reference)
         return bool(own) and float(np.linalg.norm(_ENDS @ state.factor[own], axis=1).max()) < KNOWN
 
-    def is_taken_out(self, taken: Response, state: JointState, reference: str) -> bool:
+    def is_taken_out(self, taken: Response, state: Now, reference: str) -> bool:
         """Whether `taken` is the response beside a reference, but for a part of its uncertainty."""
         own = terms_of(state, reference)
         if not own:
@@ -105,7 +98,7 @@ class OverFrequency:
         left = np.abs(_ENDS @ (state.mean[own] - np.array(taken.terms) / in_units(self.to_hz)))
         return bool(np.all(left < np.maximum(NEAR, LEFT_U * np.linalg.norm(_ENDS @ state.factor[own], axis=1))))
 
-    def differs(self, state: JointState, earlier: JointState, reference: str) -> bool:
+    def differs(self, state: Now, earlier: Now, reference: str) -> bool:
         """Whether the response beside a reference is surely another in `state` than in an earlier state."""
         own, was = terms_of(state, reference), terms_of(earlier, reference)
         if not own or len(own) != len(was):
@@ -114,7 +107,7 @@ class OverFrequency:
         u, u_was = (np.linalg.norm(_ENDS @ one.factor[k], axis=1) for one, k in ((state, own), (earlier, was)))
         return bool(np.any(moved > np.maximum(MOVED, SURELY * np.hypot(u, u_was))))
 
-    def factor(self, state: JointState, reference: str, priors: Priors) -> Array:
+    def factor(self, state: Now, reference: str, priors: Priors) -> Array:
         """A factor (N, N + 4) of the covariance of a state beside a reference, with what known filters, the bands'
         deviations and what they leave open add to that of S. (N, N) before any band.
         """
@@ -131,14 +124,14 @@ class OverFrequency:
             more[own, 1 + row] = by_axis.u * state.mean[own]
         return np.hstack([state.factor, more])
 
-    def _terms(self, state: JointState, reference: str) -> Array:
+    def _terms(self, state: Now, reference: str) -> Array:
         """The terms (K,) of the response beside a reference."""
         own, unit = self._unknowns(state, reference)
         terms = np.zeros(len(POWERS))
         terms[: len(own)] = unit[: len(own)] * state.mean[own]
         return terms
 
-    def told(self, state: JointState, reference: str, priors: Priors, coverage_factor: float) -> ResponseTold | None:
+    def told(self, state: Now, reference: str, priors: Priors, coverage_factor: float) -> ResponseTold | None:
         """The response beside a reference; None where it is no unknown."""
         own = terms_of(state, reference)
         if self.motion_hz is None:
@@ -152,20 +145,20 @@ class OverFrequency:
             known=Known.of(self.stated(priors)),
         )  # fmt: skip
 
-    def steady(self, state: JointState, reference: str, priors: Priors) -> dict[str, float]:
+    def steady(self, state: Now, reference: str, priors: Priors) -> dict[str, float]:
         """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
         frequency."""
         own, unit = self._unknowns(state, reference)
         by_unknown = -(_at_reference(self.stated(priors)) * unit)[: len(own)]
         return {state.keys[k]: float(by) for k, by in zip(own, by_unknown, strict=True)}
 
-    def log_h(self, state: JointState, reference: str, frequency_hz: float) -> float:
+    def log_h(self, state: Now, reference: str, frequency_hz: float) -> float:
         """ln |h| beside a reference at a frequency, 0 at 0 Hz."""
         own, unit = self._unknowns(state, reference)
         moved = by_term(np.array(2.0 * np.pi * frequency_hz)).real * unit
         return float(moved[: len(own)] @ state.mean[own])
 
-    def _unknowns(self, state: JointState, reference: str) -> tuple[list[int], Array]:
+    def _unknowns(self, state: Now, reference: str) -> tuple[list[int], Array]:
         """Where the first terms of the response beside a reference are in a state, and the units (5,) of all terms."""
         if self.motion_hz is not None:
             return terms_of(state, reference), in_units(self.to_hz)
@@ -173,7 +166,7 @@ class OverFrequency:
         return own, attenuating(self.first_hz) if own else np.zeros(len(POWERS))
 
     def _told_at_one_frequency(
-        self, state: JointState, reference: str, priors: Priors, coverage_factor: float
+        self, state: Now, reference: str, priors: Priors, coverage_factor: float
     ) -> ResponseTold | None:
         own = attenuation_of(state, reference)
         if not own:
@@ -211,17 +204,17 @@ def _at(frequency_hz: float) -> Array:
     return found
 
 
-def terms_of(state: JointState, reference: str) -> list[int]:
+def terms_of(state: Now, reference: str) -> list[int]:
     """Where the terms of the response beside a reference are in a state, in the order of POWERS."""
     return _named(state, reference, tuple(f"response_{power}" for power in POWERS))
 
 
-def attenuation_of(state: JointState, reference: str) -> list[int]:
+def attenuation_of(state: Now, reference: str) -> list[int]:
     """Where the attenuation at the one frequency beside a reference is in a state; empty where it is no unknown."""
     return _named(state, reference, ("attenuation",))
 
 
-def _named(state: JointState, reference: str, names: tuple[str, ...]) -> list[int]:
+def _named(state: Now, reference: str, names: tuple[str, ...]) -> list[int]:
     return [state.index(key) for key in _keys(reference, names) if key in state]
 
 
@@ -230,7 +223,7 @@ def _keys(reference: str, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(Quantity(name, RESPONSE, owner=reference).key for name in names)
 
 
-def changed(state: JointState, point: Array) -> bool:
+def changed(state: Now, point: Array) -> bool:
     """Whether a response in the state differs so much from the `point` (N,) that windows must be linearised again."""
     for owner in dict.fromkeys(q.owner for q in state.quantities if q.kind is RESPONSE):
         own = terms_of(state, owner)

@@ -69,11 +69,11 @@ Loosening = Literal["jump", "lean", "line", "filter", "remount"]
 class Kind:
     """The properties that all unknowns of one kind have in common.
 
-    `name`: identifies the kind in a snapshot; a changed name needs a migration (agent.core.migrations).
+    `name`: identifies the kind in a snapshot.
     `unit`: unit of the value; "" for S, Q and their coefficients, whose unit contains the sensor's output unit.
     `source`: the line of the uncertainty budget that its prior belongs to.
     `prior`, `mean`: standard uncertainty and value before any data; without `mean` the value is 0. If `prior` is None,
-    calib.estimate.recursion gets the uncertainty as an argument (S, Q, coefficients of temperature).
+    calib.estimate.unknowns gets the uncertainty as an argument (S, Q, coefficients of temperature).
     `walk`: SD of its random walk after one day; None for a constant.
     `in_output_unit`: `walk` and `straight` must be multiplied by the sensor's output unit per m/s2.
     `loosened_by`: the events that may change it at once, so that its uncertainty is enlarged: a "jump" of the sensor
@@ -86,7 +86,7 @@ class Kind:
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
     `stated`: the prior is a statement that the data may contradict; if false, only the data determine the value.
     `since_certificate`: it grows from the date of the reference's certificate on, without a limit. `prior` is then its
-    standard uncertainty after one year; a state begins with that of the time since this date (Linearised.begun).
+    standard uncertainty after one year; a state begins with that of the time since this date (calib.estimate.unknowns).
     """
 
     name: str
@@ -118,21 +118,21 @@ class Kind:
 class Quantity:
     """One unknown: its name, its kind, its position ("" if it is common to all positions), and its owner.
 
-    The owner is the identity of the reference to which the unknown belongs, "" for all other unknowns. Two references
-    have unknowns of the same name; `key` tells them apart in a joint state. `first`: it is the first value of an
-    unknown that walked or was loosened since then. The prior of the unknown is one of its first value.
+    The owner is the identity of the reference to which the unknown belongs, its place for an unknown of the place, and
+    "" for all other unknowns. Two references have unknowns of the same name; `key` tells them apart. `centre`: it is
+    the value about which the unknown walks (calib.estimate.unknowns).
     """
 
     name: str
     kind: Kind
     position: str = ""
     owner: str = ""
-    first: bool = False
+    centre: bool = False
 
     @property
     def key(self) -> str:
         """Identifies the unknown in a joint state."""
-        return (f"{self.name} of {self.owner}" if self.owner else self.name) + (", first" if self.first else "")
+        return (f"{self.name} of {self.owner}" if self.owner else self.name) + (", centre" if self.centre else "")
 
 
 @dataclass(frozen=True, init=False)

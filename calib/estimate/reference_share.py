@@ -8,15 +8,16 @@ reference, x1 and x2, have the covariance D1 P0 D2', and that of their differenc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from calib.estimate.estimate import Now
 from calib.estimate.gauss_newton import Solution
-from calib.estimate.joint_state import JointState
 from calib.estimate.quantities import REFERENCE, REFERENCE_CORNER, REFERENCE_DRIFT
+from calib.estimate.unknowns import EXACT
 from calib.model import Array
 
 SHARED = (
@@ -46,6 +47,11 @@ class ReferenceShare:
     own_derivative: Array
     derivative: Array
 
+    @classmethod
+    def load(cls, state: Mapping[str, Any]) -> ReferenceShare:
+        """The share whose `asdict` this is, with lists in the place of tuples."""
+        return cls(**{**state, "unknowns": tuple(state["unknowns"]), "kinds": tuple(state["kinds"])})
+
     def told(self, serial_number: str, certificate_sha256: str) -> dict[str, Any]:
         """The share as results state it (docs/shared-errors.md): `derivative` has a row for each unknown."""
         return {
@@ -72,8 +78,7 @@ class ReferenceShare:
     def corrected(self, parameters: Array, covariance: Array, stated: Array, u_stated: Array) -> tuple[Array, Array]:
         """S and Q (12,) and their covariance (12, 12) with other priors of the unknowns: `stated`, `u_stated` (n,).
 
-        That is the exchange of a prior in information form, as calib.estimate.joint_state.JointState.exchange does it:
-        exact for a linear problem with the same data and weights.
+        That is the exchange of a prior in information form, exact for a linear problem with the same data and weights.
         """
         p0, p1 = self.u_stated**2, u_stated**2
         gained = 1.0 - p1 / p0
@@ -101,30 +106,23 @@ def shared_covariance(one: Sequence[ReferenceShare], other: Sequence[ReferenceSh
     return found
 
 
-def share_in(state: JointState, factor: Array, reference: str, sensitivity: float) -> ReferenceShare:
-    """The share of a reference in a joint state. `factor` (12, N or more): of the covariance of S and Q."""
-    n = len(state)
+def share_in(now: Now, factor: Array, reference: str, sensitivity: float) -> ReferenceShare:
+    """The share of a reference in what is known now. `factor` (12, N or more): of the covariance of S and Q."""
+    n = len(now)
     own = [
-        state.index(first) if (first := replace(q, first=True).key) in state else k
-        for k, q in enumerate(state.quantities)
-        if q.kind in SHARED and q.owner == reference and not q.first
-    ]
-    own = [k for k in own if state.stated_u[k] > 0.0]
-    stated, variance, walked = state.stated_mean[own], state.stated_u[own] ** 2, state.walked[own]
-    part = variance / (variance + walked)  # of the present value, in that with which the unknown came
-    rows = part[:, None] * state.factor[own]
-    joint = rows @ rows.T + np.diag(part * walked)
+        k
+        for k, unknown in enumerate(now.unknowns.all)
+        if unknown.quantity.kind in SHARED and unknown.quantity.owner == reference
+        and unknown.quantity.centre == unknown.quantity.kind.since_certificate and unknown.u > EXACT
+    ]  # fmt: skip
+    unknowns = [now.unknowns.all[k] for k in own]
+    variance = np.array([unknown.u for unknown in unknowns]) ** 2
+    rows = now.factor[own]
     return ReferenceShare(
-        reference,
-        np.array([sensitivity]),
-        tuple(state.quantities[k].name for k in own),
-        tuple(state.quantities[k].kind.name for k in own),
-        stated.copy(),
-        np.sqrt(variance),
-        stated + part * (state.mean[own] - stated),
-        joint / variance,
-        (factor[:, :n] @ rows.T) / variance,
-    )
+        reference, np.array([sensitivity]), tuple(u.quantity.name for u in unknowns),
+        tuple(u.quantity.kind.name for u in unknowns), np.array([u.mean for u in unknowns]), np.sqrt(variance),
+        now.mean[own], rows @ rows.T / variance, (factor[:, :n] @ rows.T) / variance,
+    )  # fmt: skip
 
 
 def share_after(solution: Solution) -> ReferenceShare | None:

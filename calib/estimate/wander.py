@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from calib.estimate.joint_state import JointState
 from calib.estimate.quantities import (
-    ALL_RATES,
     MAIN_TEMPERATURE,
-    OFFSET,
     OFFSET_TEMPERATURE,
+    S_AND_Q,
     SENSITIVITY_TEMPERATURE,
     TILT_WALK,
     WALKS,
@@ -36,39 +34,15 @@ class Wander(Stated):
 
     table: ClassVar[Mapping[str, Statement]] = WALKS
 
-    def variance_a_day(self, quantities: Sequence[Quantity], scale: float, tilted_mps2: float) -> Array:
-        """(N,) variance per day of the random walk of each quantity, in the square of its unit.
+    def variance_a_day(self, scale: float, tilted_mps2: float) -> Array:
+        """(12,) variance a day of the random walks of S and Q, in the squares of their units.
 
         `scale` is the sensor's output unit per m/s2. `tilted_mps2` is the gravity by which a tilt of the mount changes
         the mean output; 0 if the walk of Q alone is wanted.
         """
-        found = np.zeros(len(quantities))
-        for k, quantity in enumerate(quantities):
-            kind = quantity.kind
-            if quantity.first:
-                continue
-            if kind is OFFSET:
-                tilted = tilted_mps2 * self.of(TILT_WALK)
-                found[k] = (self.of(kind.walk) ** 2 + tilted**2) * scale**2
-            else:
-                found[k] = (self.of(kind.walk) * (scale if kind.in_output_unit else 1.0)) ** 2
-        return found
-
-
-def wandered(state: JointState, days: float, variance_a_day: Array, bound: Array) -> JointState:
-    """A copy of the state `days` later: S and Q have drifted by their rates, and walks have increased the variances.
-
-    `variance_a_day` (N,) is the variance per day of each random walk; no variance grows beyond `bound` (N,).
-    """
-    state = state.copy()
-    if days > 0.0:
-        drift = np.eye(len(state))
-        for p, name in enumerate(ALL_RATES):
-            if name in state:
-                drift[p, state.index(name)] = days
-        state.transform(drift)
-        state.spread(np.minimum(variance_a_day * days, np.maximum(bound - state.variance, 0.0)))
-    return state
+        tilt = self.of(TILT_WALK) * tilted_mps2
+        walks = np.array([self.of(quantity.kind.walk) for quantity in S_AND_Q])
+        return np.asarray((walks**2 + np.append(np.zeros(9), np.full(3, tilt**2))) * scale**2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -164,7 +164,7 @@ def forge_memory(directory: Path, factor: float = 1.05) -> None:
             "SELECT sensor, identity, sequence, state FROM memory"
         ).fetchall():
             held = unpack(state)
-            held["estimation"]["recursion"]["state"]["mean"][:9] *= factor
+            held["estimation"]["state"]["now"]["x"][:9] *= factor
             if held["in_force"] is not None:
                 held["in_force"]["sensitivity"] = (np.array(held["in_force"]["sensitivity"]) * factor).tolist()
             row = (sensor, identity, sequence, pack(held))

@@ -94,7 +94,7 @@ def forge(path: Path, what: str) -> None:
             data = encode(number, msgspec.structs.replace(item, sensitivity=sensitivity)) + signature
         elif what == "snapshot" and isinstance(item, RunStart):
             state = unpack(item.snapshot)
-            state["channels"]["s"]["estimation"]["recursion"]["state"]["mean"][:9] *= 1.05
+            state["channels"]["s"]["estimation"]["state"]["now"]["x"][:9] *= 1.05
             data = encode(number, msgspec.structs.replace(item, snapshot=pack(state)))
         changed.append((topic, schema, *times, data))
     assert changed != found.messages or what == "unsigned"

@@ -1,4 +1,4 @@
-"""The cost of a window does not grow with the number of windows before it; docs/performance.md has ten thousand."""
+"""The cost of a window hardly grows with the number of windows before it; docs/performance.md has ten thousand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
 
 WINDOWS = 170
-EARLY, LATE = range(60, 70), range(160, 170)  # the agent keeps summaries of the newest 48 windows only
+EARLY, LATE = range(60, 70), range(160, 170)  # of one day; the newest 48 windows and one record an hour are kept
+LARGEST = 1_500_000  # bytes of a state with a record an hour for two weeks, of which 170 are here
 
 
 def test_work_and_state_are_flat() -> None:
@@ -35,4 +36,4 @@ def test_work_and_state_are_flat() -> None:
     assert len(sizes) > 0.95 * WINDOWS
     early, late = (sum(at[k + 1] - at[k] for k in part) for part in (EARLY, LATE))
     assert late < 1.1 * early  # about a thousand calls for each window
-    assert max(sizes[k] for k in LATE) < 1.05 * max(sizes[k] for k in EARLY)
+    assert max(sizes[k] for k in LATE) < LARGEST

@@ -46,7 +46,8 @@ def test_a_step_of_one_per_cent_is_found_and_followed(elsewhere: float) -> None:
 def test_the_mean_output_is_right_and_q_within_its_uncertainty(elsewhere: float) -> None:
     seen = followed(elsewhere)
     assert np.abs(seen.mean_error_mps2).max() < 2e-3
-    assert np.all(np.abs(seen.offset_error) < 2 * np.array(seen.u_offset))
+    # Three axes of one sensor: with probability 0.96 all stay within 2.5 u.
+    assert np.all(np.abs(seen.offset_error) < 2.5 * np.array(seen.u_offset))
     # The data determine Q only as well as tilt and gravity are known: 0.1 deg is 17 mm/s2 on a horizontal axis.
     assert np.min(np.array(seen.u_offset)[:, :2]) > np.deg2rad(0.1) * 9.8
 

@@ -9,9 +9,9 @@ import pytest
 
 from agent.core.snapshot import pack, unpack
 from calib.estimate.nuisances import Priors
-from calib.estimate.recursion import Recursion
+from calib.estimate.record import Record
+from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.estimate.window_rows import Summary
 from tests.building_windows import building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE
 
@@ -23,16 +23,16 @@ EXACT = {"level_mps2": (0.0, 0.5, 0.0), "noise_mps2": 0.001}
 PRIORS = Priors(reference=1e-3, offset_mps2=1e-3, lag_window_s=0.0)
 
 
-def told_of_a_drift(days: range, u_rate: np.ndarray) -> Recursion:
+def told_of_a_drift(days: range, u_rate: np.ndarray) -> State:
     """Ten windows without drift, then the drift is told and a window comes each of `days`."""
     random = np.random.default_rng(1)
-    found = Recursion(MEAN, U, PRIORS, replace(Wander.none(), offset_rate_mps2=1e-9), TemperatureModel(), fixed=True)
+    found = State(MEAN, U, PRIORS, replace(Wander.none(), offset_rate_mps2=1e-9), TemperatureModel(), fixed=True)
     for k in range(10):
-        found.update(Summary.of(building_window(random, **EXACT), 0.1 * k))
-    found.loosen(np.where(np.arange(12) == SYY, RATE, 0.0), u_rate=u_rate)
+        found.update(Record.of(building_window(random, **EXACT), 0.1 * k))
+    found.step(found.changes(np.where(np.arange(12) == SYY, RATE, 0.0), u_rate=u_rate))
     for day in days:
         Q = Q_TRUE + np.array([1e-3 * day, 0.0, 0.0])
-        found.update(Summary.of(building_window(random, S=drifted(day), Q=Q, **EXACT), day))
+        found.update(Record.of(building_window(random, S=drifted(day), Q=Q, **EXACT), day))
     return found
 
 
@@ -52,7 +52,7 @@ def test_the_rates_are_recovered_and_q_and_s_go_on_with_them() -> None:
     assert abs(rate - RATE) < 3 * u < 0.1 * RATE
     rate, u = found.quantity("Qx_rate")
     assert abs(rate - 1e-3) < 3 * u < 5e-4
-    assert [name for name in found.names if name.endswith("_rate")] == ["Qx_rate", "Qy_rate", "Qz_rate", "Syy_rate"]
+    assert {name for name in found.names if name.endswith("_rate")} == {"Qx_rate", "Qy_rate", "Qz_rate", "Syy_rate"}
     later = found.law(129.0)
     u = np.sqrt(later.covariance[SYY, SYY])
     assert abs(later.mean[SYY] - drifted(129.0).flat[SYY]) < 3 * u < 4e-3
@@ -68,7 +68,7 @@ def test_a_state_with_a_rate_of_s_goes_on_from_its_snapshot() -> None:
     found = told_of_a_drift(range(1, 5), rates(SYY))
     again = told_of_a_drift(range(0), rates())
     again.load(unpack(pack(found.snapshot())))
-    window = Summary.of(building_window(np.random.default_rng(2), S=drifted(40.0), **EXACT), 40.0)
+    window = Record.of(building_window(np.random.default_rng(2), S=drifted(40.0), **EXACT), 40.0)
     for state in (found, again):
         state.update(window)
     assert pack(again.snapshot()) == pack(found.snapshot())

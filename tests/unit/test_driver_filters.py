@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -19,7 +18,6 @@ from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import Estimation
 from agent.core.events import CalibrationUpdate, DeviceChange, Event, StatusChange
 from agent.core.kept import OTHER_FILTERS, keep, take_up
-from agent.core.pipeline import Pipeline
 from agent.core.snapshot import pack
 from agent.recording.reading import RecordingReader
 from benchmarks.online import chip
@@ -236,25 +234,6 @@ def test_the_same_rate_at_the_next_start_is_the_same_filter_also_while_the_refer
 def test_a_device_with_another_setting_that_is_no_filter_is_another_device() -> None:
     _, told, _ = restarted(Chip(62.5, told=False), Chip(125.0, told=False))
     assert told[0].startswith("the stored calibration belongs to")
-
-
-def test_a_state_of_the_version_before_goes_on_and_its_filters_are_others() -> None:
-    (channel,) = drawn().config.channels
-    pipeline = Pipeline.begin(drawn().config, "run-1", 0, 0, {})
-    for event in events({}):
-        pipeline.step(event)
-    (memory,) = pipeline.all_memories()
-    held: dict[str, Any] = msgspec.msgpack.decode(memory.state)
-    assert held["state"].pop("filters") == {"sensor": [], "reference": []}
-    assert held["state"].pop("device")
-    held["version"] = 5
-    before = msgspec.msgpack.encode(held)
-    assert take_up(before, DriverFilters(channel), 1.0).reason == "restored from the previous run"
-    now = DriverFilters(channel)
-    now.hear("sensor", {"filters": ["lowpass corner_hz=30"]})
-    taken = take_up(before, now, 1.0)
-    assert taken.reason.endswith(OTHER_FILTERS)
-    assert taken.estimation.recursion.windows >= WINDOWS - 1
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Recursion, gate and drift test as one: what comes in force, what does not, and that it never stops for ever."""
+"""State, gate and drift test as one: what comes in force, what does not, and that it never stops for ever."""
 
 from __future__ import annotations
 
@@ -124,9 +124,8 @@ def test_a_larger_uncertainty_is_in_force_although_rounding_moved_the_state() ->
     for rounding in (0.0, 1e-12):
         found = estimation(**stated, uncertainty={"rotation_deg": 0.4})
         found.load(unpack(pack(before.snapshot())))
-        found.restate(None, remounted=False)
         found.in_force = replace(found.in_force, covariance=found.in_force.covariance * (1.0 + rounding))
-        assert found.meet("A", "", 1.0)
+        assert found.restate(None, remounted=False)
         ratio = found.in_force.standard_uncertainty / before.in_force.standard_uncertainty
         assert ratio[[1, 7]].min() > 1.1, f"rounding {rounding:g}"  # the motion is along y
 
@@ -163,7 +162,7 @@ def test_propose_and_observe_put_nothing_in_force() -> None:
         assert actions(judged) == ["take"] * 6
         assert [j.decision.propose for j in judged] == [proposes] * 6
         assert found.in_force is prior
-        assert found.recursion.windows == 6  # the state goes on unseen
+        assert found.state.windows == 6  # the state goes on unseen
 
 
 def test_what_is_accepted_keeps_how_it_goes_with_temperature() -> None:

@@ -33,8 +33,8 @@ def channel(*stances: dict[str, Any], **more: Any) -> Channel:
 def state_of(made_with: Channel) -> bytes:
     """A state with a calibration in force."""
     estimation = Estimation(made_with, None)
-    state = estimation.recursion
-    in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, state, state, lambda _: None)
+    state = estimation.state
+    in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, state, state.shares, lambda _: None)
     return keep(DriverFilters(made_with), "", estimation, in_force, 0.0, 5)
 
 
@@ -62,7 +62,7 @@ def test_a_state_made_at_another_mount_keeps_s_and_its_references_and_loosens_th
     found = after(before, now)
     assert found.reason == f"{RESTORED}; {EXCHANGED}: {named}"
     assert found.in_force is not None
-    assert found.estimation.recursion.windows == 0
+    assert found.estimation.state.windows == 0
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from calib.estimate.adjustment import adjust
 from calib.estimate.condense import condense
 from calib.estimate.deviations import U_CORNER, BetweenBands, LeftOpen
 from calib.estimate.nuisances import Priors
-from calib.estimate.recursion import Recursion
+from calib.estimate.record import Record
+from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.estimate.window_rows import Summary
 from calib.excitation.bands import motion_band_hz
 from calib.excitation.excited import excited
 from calib.model import Array
@@ -167,9 +167,9 @@ def test_the_agent_says_what_files_say(disturbed: Disturbance, source: str, leas
     of, _ = made(disturbed, 1, lowpass(1, 30.0))
     windows = [w for w in of.files.windows(0.0) if w.used]
     stated = Priors(reference=U_REFERENCE, reference_frequency_hz=of.reference_frequency_hz)
-    found = Recursion(MEAN, U, stated, replace(Wander.none(), offset_rate_mps2=1e-9), TemperatureModel(), fixed=False)
+    found = State(MEAN, U, stated, replace(Wander.none(), offset_rate_mps2=1e-9), TemperatureModel(), fixed=False)
     for k, window in enumerate(windows):
-        found.update(Summary.of(window, k * 1e-3))
+        found.update(Record.of(window, k * 1e-3))
     band_hz = motion_band_hz(windows[:1])
     assert band_hz is not None
     at_once = adjust(windows, Priors(stated.values, MEAN, np.diag(U**2)).with_response(band_hz, 1.1 * band_hz[1]))

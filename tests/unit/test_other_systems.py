@@ -43,9 +43,9 @@ def test_files_are_worked_on_everywhere(tmp_path: Path) -> None:
         cwd=ROOT, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    # 4: another engine made the recording; it was read to its end, no check failed, and today's results are near.
+    # 4: an engine with other results made the recording; it was read to its end, and no check failed.
     statuses = dict(zip([command[0] for command in commands], json.loads(done.stdout.splitlines()[-1]), strict=True))
-    assert [statuses[name] for name in ("replay", "audit")] == [0, 4], done.stderr
+    assert [statuses[name] for name in ("replay", "audit")] == [4, 4], done.stderr
     made = ("calibrate", "certificate", "convert", "show")
     assert [statuses[name] for name in (*made, "report")] == [0, 0, 0, 0, 2], done.stderr
     assert done.stderr.count("internal fault") == 0

@@ -11,7 +11,7 @@ from agent.calibrate.stated import options_of
 from agent.cli.calibrate import calibrate
 from agent.config.knowledge import Certificate, Knowledge, Prior, Process, Uncertainty
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import KINDS, PRIORS, WALKS, Quantity, Statement
+from calib.estimate.quantities import KINDS, PRIORS, WALKS, Statement
 from calib.estimate.wander import Wander
 from calib.recorded.priors import priors_of
 
@@ -104,13 +104,12 @@ def test_one_number_is_replaced_and_the_others_stay() -> None:
 
 def test_what_wanders_wanders_by_its_own_walk() -> None:
     walks = Wander({name: float(k + 1) for k, name in enumerate(WALKS)})
-    quantities = [Quantity(name, kind) for name, kind in KINDS.items()]
-    found = dict(zip(KINDS, np.sqrt(walks.variance_a_day(quantities, 10.0, 0.0)), strict=True))
-    assert {name for name, u in found.items() if u > 0.0} == {
+    assert {kind.name for kind in KINDS.values() if walks.of(kind.walk) > 0.0} == {
         "sensitivity", "offset", "offset rate", "tilt", "lean", "gravity direction by position", "reference drift"
     }  # fmt: skip
-    assert found["sensitivity"] == pytest.approx(10.0 * walks.sensitivity)
-    assert found["reference drift"] == pytest.approx(walks.reference_drift)
+    found = np.sqrt(walks.variance_a_day(10.0, 2.0))
+    assert found[:9] == pytest.approx(10.0 * walks.sensitivity)
+    assert found[9:] == pytest.approx(10.0 * np.hypot(walks.offset_mps2, 2.0 * walks.tilt_rad))
 
 
 @pytest.mark.parametrize("statement", [*PRIORS.values(), *WALKS.values()], ids=lambda s: s.name)

@@ -120,7 +120,7 @@ def test_on_a_turning_mount_gravity_tells_that_it_was_the_reference() -> None:
     before = found.in_force
     assert "adopt" in days(found, 36, turned(12, STEP))
     days(found, 48, turned(24, STEP))
-    drift, u = found.recursion.quantity("reference_drift")
+    drift, u = found.state.quantity("reference_drift")
     assert abs(drift - STEP) < 3 * u < 0.6 * STEP
     assert np.all(np.abs(found.in_force.sensitivity - S_TRUE).ravel() < 3 * u_of(found)[:9])
     assert np.all(u_of(found)[[0, 4, 8]] < 1.2 * before.standard_uncertainty[[0, 4, 8]])

@@ -10,11 +10,10 @@ import pytest
 
 from agent.config import Channel, parse_config
 from agent.core.estimation import Estimation
-from agent.core.snapshot import pack, unpack
 from calib.estimate.nuisances import Priors
-from calib.estimate.recursion import Recursion
+from calib.estimate.record import Record
+from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.estimate.window_rows import Summary
 from calib.model import Pose, Window
 from tests.building_windows import GRAVITY
 from tests.clamp_windows import Q_TRUE, S_TRUE, window_of
@@ -118,7 +117,7 @@ def test_the_uncertainty_of_the_direction_is_that_of_the_angle() -> None:
     random, found, stated = np.random.default_rng(3), Estimation(channel, None), pose_of(channel)
     direction = turned(1.4, (0.0, 0.0, 1.0)) @ stated.direction[:, 0]
     assert set(hours(found, [window(random, stated, direction, GRAVITY) for _ in range(6)], 0)) == {"take"}
-    calibration = found.recursion.result()
+    calibration = found.state.result()
     off = (calibration.sensitivity - S_TRUE).ravel()
     assert abs(off[1]) > 0.02
     assert np.all(np.abs(off) < 2.0 * calibration.standard_uncertainty[:9])
@@ -129,51 +128,21 @@ def test_a_direction_known_well_on_a_mount_that_may_lean() -> None:
     """What is stated of gravity does not widen what is stated of the direction."""
     known = {"angle_deg": 0.1, "tilt_deg": 3.0, "transverse_motion_pct": 0.0}
     found, _ = settled(channel_of(ALONG_Y, uncertainty=known, prior=DATA_SHEET), np.random.default_rng(4))
-    u = found.recursion.result().standard_uncertainty
+    u = found.state.result().standard_uncertainty
     assert u[1] == pytest.approx(np.deg2rad(np.hypot(0.1, 0.1)), rel=0.05)
     assert np.all(u[9:11] > 0.99 * np.deg2rad(3.0) * 9.80665)
 
 
-def test_a_state_that_does_not_know_the_lean_learns_it_with_the_next_window() -> None:
-    """As one of version 1 of the snapshots: direction and gravity turned as one, by what was stated of the tilt."""
-    random = np.random.default_rng(5)
-    constant = {
-        "certificate": {"stability_pct": 0.0}
-    }  # else the base has a drift of variance 0, without a Cholesky factor
-    found, stated = settled(channel_of(UNIAXIAL, **constant), random)
-    state = found.snapshot()
-    recursion = state["recursion"]
-    kept = [not name.startswith("lean") for name, *_ in recursion["state"]["quantities"]]
-    for joint in (recursion["state"], recursion["base"]):
-        joint["quantities"] = [q for q, keep in zip(joint["quantities"], kept, strict=True) if keep]
-        joint["mean"], joint["factor"] = joint["mean"][kept], np.linalg.cholesky(_covariance(joint, kept))
-        for name in ("stated_mean", "stated_u", "walked"):
-            joint[name] = joint[name][kept]
-    recursion["point"] = recursion["point"][kept]
-    recursion["held"]["by"] = {n: v for n, v in recursion["held"]["by"].items() if not n.startswith("lean")}
-    again = Estimation(channel_of(UNIAXIAL, **constant), None)
-    again.load(unpack(pack(state)))
-    assert "adopt" in leaning(again, stated, random, 2.0)
-    off = again.in_force.offset - Q_TRUE
-    assert np.all(np.abs(off) < 2.0 * again.in_force.standard_uncertainty[9:])
-
-
-def _covariance(joint: dict[str, Any], kept: list[bool]) -> np.ndarray:
-    rows = joint["factor"][kept]
-    return np.asarray(rows @ rows.T)
-
-
 def test_of_positions_left_long_ago_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Along gravity a position has unknowns of motion across it, in phase and in quadrature."""
-    monkeypatch.setattr("calib.estimate.window_state.MOST_POSITIONS", 3)
+    monkeypatch.setattr("calib.estimate.state.MOST_POSITIONS", 3)
     channel, random = channel_of(MOUNTS["along gravity"]), np.random.default_rng(11)
     prior, stated = channel.prior, pose_of(channel)
     u = prior.standard_uncertainty(prior.mean(None))
-    found = Recursion(prior.mean(None), u, Priors(), Wander(), TemperatureModel(), fixed=False)
+    found = State(prior.mean(None), u, Priors(), Wander(), TemperatureModel(), fixed=False)
     for k in range(5):
         one = window(random, replace(stated, position=f"p{k}"), stated.direction[:, 0], GRAVITY)
-        found.update(Summary.of(one, k / 24.0))
-    quantities = found.snapshot()["state"]["quantities"]
-    assert {position for _, _, position, *_ in quantities} == {"", "p2", "p3", "p4"}
+        found.update(Record.of(one, float(k)))
+    assert {quantity.position for quantity in found.quantities} == {"", "p1", "p2", "p3", "p4"}  # p4 came after the day
     assert "transverse_a[p4]_quadrature" in found.names
-    assert [name for name in found.names if "p1" in name] == []
+    assert [name for name in found.names if "p0" in name] == []

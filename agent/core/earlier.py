@@ -1,0 +1,65 @@
+"""Snapshots of versions before 8, in which a recursion held S and Q.
+
+Its posterior cannot become records of windows. So the calibration in force is left of an estimation, from which the
+estimate begins as after a rollback. Samples, clocks, positions, devices and the numbering of the results go on. From
+version 8 on a snapshot holds records and statements, which a changed estimator solves anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from calib.excitation.placing import SHORTEST_S
+from calib.excitation.standing import USUAL
+
+
+def brought_up(version: int, state: dict[str, Any]) -> None:
+    """Change what a pipeline of this version wrote, or what it kept of a device, to what version 8 writes.
+
+    Raises KeyError or TypeError where a part is missing.
+    """
+    for older in range(version, 8):
+        if older in CHANGES:
+            CHANGES[older](state)
+    for holder in [state, *state.get("channels", {}).values()]:
+        if held := holder.get("estimation"):
+            holder["estimation"] = {
+                "state": None, "day": held["recursion"]["day"], "gate": held["gate"], "in_force": held["in_force"],
+            }  # fmt: skip
+
+
+def _from_version_1(state: dict[str, Any]) -> None:
+    """A stream had one clock; later each run between two restarts of a device has its own."""
+    for channel in state.get("channels", {}).values():
+        for stream in channel["streams"].values():
+            run = {"clock": stream.pop("clock"), "blocks": stream.pop("blocks")}
+            stream["runs"] = [run] if run["clock"] else []
+
+
+def _from_version_2(state: dict[str, Any]) -> None:
+    """Positions were found with the usual smoothing alone, runs of samples had no number, and there was one
+    reference."""
+    for channel in state.get("channels", {}).values():
+        channel["run_numbers"], channel["piece_number"] = {}, 0
+        channel["references"], channel["not_certified"] = [channel.pop("reference")], [channel["not_certified"]]
+        for stream in channel["streams"].values():
+            for run in stream["runs"]:
+                run["number"] = 0
+        if "standing" in channel["places"]:
+            channel["places"]["standing"]["longest"] = USUAL
+            for stretch in channel["places"]["stretches"]:
+                stretch["smoothing_s"] = SHORTEST_S
+
+
+def _from_version_5(state: dict[str, Any]) -> None:
+    """Drivers stated no filters, and a sensor was kept by its identity alone."""
+    for holder in [state, *state.get("channels", {}).values()]:
+        holder |= {"filters": {}, "device": ""}
+
+
+CHANGES: Mapping[int, Callable[[dict[str, Any]], None]] = {
+    1: _from_version_1,
+    2: _from_version_2,
+    5: _from_version_5,
+}

@@ -1,0 +1,164 @@
+"""What held windows show that agree with each other: which of the devices has changed, and the state after that.
+
+Each hypothesis is a step of its own unknowns before the first held window. The whole is solved anew with it and with
+the held windows. The sum of squares of all rows tells how well it explains them, and those of two references together
+tell the sensor from its references. With one reference they cannot: S is then wrong by 0 or by the step d, and the
+state follows the step, with u(S) larger by what the reference may have done, until something else tells S.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agent.core.gate import Limit
+from calib.estimate.quantities import REFERENCE, REFERENCE_DRIFT, Quantity
+from calib.estimate.record import Record
+from calib.estimate.state import State
+from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.model import Array, Calibration, own_channels
+
+# A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
+# offset two m/s2, which is a mount that leans by 12 deg.
+JUMP_SENSITIVITY = 0.1
+JUMP_OFFSET_MPS2 = 2.0
+SURELY = 1.6  # U = 2 u covers the errors 0 and d if u is d / 1.6
+SIGNIFICANT = 3.0  # standard uncertainties of a change
+LARGEST_PHASE_RAD = 0.1  # of a lag that was not taken out: its second order is then 0.5 % of S
+WIDER = 10.0  # the possible jump over the one that was found: else the reference would take the larger part of it
+AN_UNKNOWN = 2.0  # chi-squared that an unknown more must gain (Akaike 1974)
+DECISIVE = 10.0  # hypotheses whose chi-squared differ by less are not told apart: a likelihood ratio of 150
+NOTHING = np.zeros(12)  # of S and Q
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tried:
+    """A hypothesis: the state after its step and the held windows, by how much chi-squared grows, and how many unknowns
+    the step has. `fits`: the held windows agree with it within what chance allows."""
+
+    state: State
+    chi2: float
+    unknowns: int
+    fits: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """The names of the reference in use and of the other one ("" if there is none), and the stability of the former in
+    a year, relative."""
+
+    own: str
+    other: str
+    stability: float
+
+
+def confirmed(state: State, held: Sequence[Record], devices: Devices, limit: Limit) -> tuple[State | None, str]:
+    """The state to adopt after the held windows, and which device has changed, for the operator.
+
+    None if the held windows do not agree with each other. `limit` is that of the gate.
+    """
+    before = state.chi2_beside(held)
+    sensor = _tried(state, held, _of_sensor(state, held), limit, before)
+    own, other = devices.own, devices.other
+    if len({record.reference for record in held}) > 1:
+        told = f": windows with {own} and with {other} show the same change, so the sensor has changed"
+        return (sensor.state if sensor.fits else None), told
+    channels = _channels(state)
+    stepped = dict.fromkeys((q.key for q in channels), JUMP_SENSITIVITY / SURELY)
+    reference = _tried(state, held, state.changes(NOTHING, line=True) | stepped, limit, before)
+    # The step of the sensor has more unknowns, and so fits the better, if nothing else contradicts it.
+    if reference.fits and reference.chi2 < sensor.chi2 - DECISIVE:
+        why = f"windows with {other} still agree" if other else "gravity still agrees"
+        return reference.state, (
+            f": the reference {own} has changed by {_sizes(state, reference.state, channels)}, because {why} with S. S "
+            f"stays as it was; have {own} calibrated"
+        )
+    told = ""
+    if other:
+        more = AN_UNKNOWN * (sensor.unknowns - reference.unknowns)
+        if sensor.fits and sensor.chi2 < reference.chi2 - more - DECISIVE:
+            return sensor.state, f": windows with {other} show the same change, so the sensor has changed"
+        told = f": no window with {other} tells whether the sensor or the reference {own} has changed"
+    return _of_either(state, held, sensor, devices.stability, limit, before), told
+
+
+def _of_sensor(state: State, held: Sequence[Record], leaning_rad: float = 0.0, wider: float = 1.0) -> dict[str, float]:
+    """A line that was plugged anew may be late by another time; that is no change of S or Q."""
+    return state.changes(wider * possible_jump(state, held), leaning_rad, line=True, another_filter=True)
+
+
+def _tried(state: State, held: Sequence[Record], u: Mapping[str, float], limit: Limit, before: float) -> Tried:
+    after = state.after(held, u)
+    grown = after.chi2 - before
+    fits = grown <= limit(sum(record.rows for record in held)) and not _made_otherwise(state, after, held)
+    return Tried(after, grown, len(u), fits)
+
+
+def _made_otherwise(before: State, after: State, held: Sequence[Record]) -> bool:
+    """Whether the held windows were made with another filter or lag taken out than is right: they tell no exact S."""
+    phase_rad = max(abs(after.lag_s - record.lag_s) * float(np.sqrt(record.omega2)) for record in held)
+    return phase_rad > LARGEST_PHASE_RAD or after.has_another_response(before)
+
+
+def _of_either(
+    state: State, held: Sequence[Record], sensor: Tried, stability: float, limit: Limit, chi2: float
+) -> State | None:
+    """The sensor made the step, or the reference did: S follows, and its u covers both."""
+    if not sensor.fits:
+        return None
+    before, after = state.result(), sensor.state.result()
+    moved = np.abs(after.offset - before.offset)
+    significant = moved > SIGNIFICANT * after.standard_uncertainty[9:]
+    leaning = tilt_rad(np.where(significant, moved, 0.0), state.scale)
+    found = float(np.abs(after.sensitivity - before.sensitivity).max()) / state.scale
+    u = _of_sensor(state, held, leaning, max(1.0, WIDER * found / JUMP_SENSITIVITY))
+    tried = _tried(state, held, u | _of_reference(state, held, before, after, stability), limit, chi2)
+    return tried.state if tried.fits else None
+
+
+def _of_reference(
+    state: State, held: Sequence[Record], before: Calibration, after: Calibration, stability: float
+) -> dict[str, float]:
+    """By how much the reference may have stepped, relative, by the key of its drift: it indicates more by the part by
+    which S times the direction of a channel is larger."""
+    found, change = {}, after.sensitivity - before.sensitivity
+    drifts = [quantity for quantity in state.present if quantity.kind is REFERENCE_DRIFT]
+    direction = held[0].pose.direction[:, : own_channels(held[0].channels)]
+    for quantity, way in zip(drifts, direction.T, strict=False):
+        output = before.sensitivity @ way
+        by = np.kron(output, way) / (output @ output)  # of the relative step, by the elements of S
+        step, u = float(by @ change.ravel()), float(np.sqrt(by @ after.covariance[:9, :9] @ by))
+        if abs(step) > SIGNIFICANT * u:
+            found[quantity.key] = max(stability, abs(step) / SURELY)
+    return found
+
+
+def _channels(state: State) -> list[Quantity]:
+    """What a step of the reference in use changes: its drift, or its sensitivity if it is stated not to drift."""
+    drifts = [quantity for quantity in state.present if quantity.kind is REFERENCE_DRIFT]
+    return drifts or [quantity for quantity in state.present if quantity.kind is REFERENCE]
+
+
+def _sizes(before: State, after: State, channels: Sequence[Quantity]) -> str:
+    sizes = []
+    for quantity in channels:
+        (value, u), was = after.quantity(quantity.key), before.quantity(quantity.key)[0]
+        if abs(value - was) > SIGNIFICANT * u:
+            axis = f"{quantity.name[-1]} " if len(channels) > 1 else ""
+            sizes.append(f"{axis}{100.0 * (value - was):+.3g} %")
+    return ", ".join(sizes)
+
+
+def possible_jump(state: State, held: Sequence[Record]) -> Array:
+    """(12,) how far S and Q may have jumped: only what these windows tell of, so that no other column moves."""
+    told = np.any([state.innovation(record).information > 0.0 for record in held], axis=0)
+    size = np.append(np.full(9, JUMP_SENSITIVITY), np.full(3, JUMP_OFFSET_MPS2)) * state.scale
+    return np.where(told, size, 0.0)
+
+
+def tilt_rad(offset: Array, scale: float) -> float:
+    """The tilt of the mount that would move the mean output as much as an offset (3,), in output unit: the data cannot
+    tell one from the other. `scale` is the output unit per m/s2."""
+    return float(np.abs(offset).max(initial=0.0) / (scale * STANDARD_GRAVITY_MPS2))

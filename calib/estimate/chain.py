@@ -1,0 +1,110 @@
+"""Least squares over a chain of epochs in square-root form: forward, one more epoch, and back.
+
+All rows are in units of their own standard deviation. They act on deviations d (N,) of the unknowns from a point of
+linearisation, so that |R d - z|^2 is what is known of an epoch. From one epoch to the next
+
+    d' = F d + gap + G w        w (J,) of unit variance
+
+QR eliminates w, which leaves one link an epoch (Bierman 1977, ch. VI; Paige and Saunders 1977). The triangle is never
+squared: normal equations would lose half of the digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.model import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passage:
+    """From an epoch to the next: `back` (N, N) is the inverse of F, `gap` (N,), `noise` G (N, J)."""
+
+    back: Array
+    gap: Array
+    noise: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """What was eliminated: own w + next d' = z, with own (J, J), next (J, N), z (J,), and the passage."""
+
+    own: Array
+    next: Array
+    z: Array
+    passage: Passage
+
+
+def with_rows(root: Array, rows: Array) -> Array:
+    """The triangle (N, N + 1) of [R | z] with rows (r, N + 1)."""
+    return np.asarray(np.linalg.qr(np.vstack([root, rows]), mode="r"))[: root.shape[1] - 1]
+
+
+def passed(root: Array, passage: Passage, rows: Array | None = None) -> tuple[Array, Link]:
+    """The triangle of the next epoch, with its own `rows` (r, N + 1) if there are any, and the link to it."""
+    size, j = root.shape[1] - 1, passage.noise.shape[1]
+    through = root[:, :size] @ passage.back
+    own = 0 if rows is None else len(rows)
+    wide = np.zeros((j + size + own, j + size + 1))
+    wide[:j, :j] = np.eye(j)
+    wide[j : j + size, :j] = -through @ passage.noise
+    wide[j : j + size, j:-1] = through
+    wide[j : j + size, -1] = root[:, size] + through @ passage.gap
+    if rows is not None:
+        wide[j + size :, j:] = rows
+    triangle = np.asarray(np.linalg.qr(wide, mode="r"))
+    link = Link(triangle[:j, :j], triangle[:j, j:-1], triangle[:j, -1], passage)
+    return triangle[j : j + size, j:], link
+
+
+def solved(root: Array) -> tuple[Array, Array]:
+    """d (N,), and a factor (N, N) of its covariance, of a triangle (N, N + 1)."""
+    inverse = np.asarray(np.linalg.inv(root[:, :-1]), dtype=np.float64)
+    return inverse @ root[:, -1], inverse
+
+
+def forward(root: Array, rows: Sequence[Array], passages: Sequence[Passage]) -> tuple[Array, list[Link]]:
+    """All epochs. `root` (N, N + 1) is what is known before the first one, `rows` (r, N + 1) those of each epoch, and
+    `passages` those from each one to the next."""
+    root, links = with_rows(root, rows[0]), list[Link]()
+    for own, passage in zip(rows[1:], passages, strict=True):
+        root, link = passed(root, passage, own)
+        links.append(link)
+    return root, links
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed:
+    """All epochs by all rows: `d` (K, N), `own` (K, N, N) their covariances, `with_last` (K, N, N) those of each epoch
+    (rows) with the last one (columns). `noise_with_last`: (J, N) those of each passage's w with the last epoch."""
+
+    d: Array
+    own: Array
+    with_last: Array
+    noise_with_last: Sequence[Array]
+
+
+def backward(root: Array, links: Sequence[Link], *, covariance: bool = True) -> Smoothed:
+    """From the last epoch back to the first."""
+    d, factor = solved(root)
+    joint = factor @ factor.T
+    count, size = len(links) + 1, len(d)
+    out, (own, with_last) = np.zeros((count, size)), (np.zeros((count if covariance else 0, size, size)) for _ in "oc")
+    out[-1], noises = d, [np.zeros((0, size))] * len(links)
+    if covariance:
+        own[-1] = with_last[-1] = joint
+    for k in range(count - 2, -1, -1):
+        link, p = links[k], links[k].passage
+        inverse = np.linalg.inv(link.own)
+        back = p.back @ p.noise
+        out[k] = p.back @ (out[k + 1] - p.gap) - back @ (inverse @ (link.z - link.next @ out[k + 1]))
+        if covariance:
+            follows = p.back + back @ inverse @ link.next
+            left = back @ inverse
+            own[k] = follows @ own[k + 1] @ follows.T + left @ left.T
+            with_last[k] = follows @ with_last[k + 1]
+            noises[k] = -inverse @ link.next @ with_last[k + 1]
+    return Smoothed(out, own, with_last, noises)

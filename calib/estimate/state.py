@@ -1,0 +1,650 @@
+"""The state of one sensor on-line: records of windows, statements, and what they say of S and Q now.
+
+A window is predicted, and appended to the newest epoch, without a look at the others. The whole is solved anew
+(calib.estimate.estimate) where a statement changed, where the estimate has moved so far that windows must be linearised
+again, and at the end of each day of the data, when old records are merged (calib.estimate.thinning).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from calib.estimate.correction import Law
+from calib.estimate.determined import determined
+from calib.estimate.estimate import Estimate, Now, estimate
+from calib.estimate.gauss_newton import Flags
+from calib.estimate.innovation import Innovation
+from calib.estimate.never_turned import never_turned
+from calib.estimate.nuisances import Priors
+from calib.estimate.over_frequency import OverFrequency, changed
+from calib.estimate.quantities import ALL_RATES, KINDS, LAG, PRIORS, REFERENCE_DRIFT, S_AND_Q, Quantity
+from calib.estimate.record import Record
+from calib.estimate.reference_share import ReferenceShare, share_in
+from calib.estimate.response_told import ResponseTold
+from calib.estimate.rows import Noise
+from calib.estimate.statements import Dated, Statements, Step
+from calib.estimate.thinning import thinned
+from calib.estimate.wander import TemperatureModel, Wander
+from calib.model import Array, Calibration, scale_of
+from calib.signal.response import Response
+
+DATED = ", calibrated "  # in the identity of a reference whose certificate states its date
+STEADY = np.zeros(12)  # rates of S and Q
+METHOD = "3 (recursive adjustment)"
+MOST_POSITIONS, MOST_REFERENCES = 48, 8  # whose records are kept
+OF_REFERENCES = [  # what belongs to a place is as it is stated now, whichever reference stands there
+    s.name
+    for kind in KINDS.values()
+    if kind.of_reference and not kind.of_place
+    for s in kind.statements
+    if s.name in PRIORS
+]
+MOVED_U = 0.3  # standard uncertainties: what is not linear within so little is far below u
+DOUBT = 1.0  # times its variance that every unknown is less certain where its correlation with S and Q was lost
+Jump = Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Mounted:
+    """What is known of a reference by its identity: the place where it is or was mounted, the sensitivity and the day
+    of its certificate (None if no date is stated), and what is stated of it (names of OF_REFERENCES)."""
+
+    place: int
+    sensitivity: float
+    certified_day: float | None
+    stated: Mapping[str, float]
+
+
+class State:
+    """S, Q and all else of one sensor. The methods under "reading" do not change it, those under "changing" do.
+
+    `mean`, `standard_uncertainty` (12,): what was known of S, Q beforehand, in output units; `fixed` mounts do not
+    turn. Days count from any origin. `check`: the priors beside further references, which are mounted all the time as
+    the first one is. The first has place 0, the next one has place 1.
+    """
+
+    def __init__(
+        self,
+        mean: Array,
+        standard_uncertainty: Array,
+        priors: Priors,
+        wander: Wander,
+        temperature: TemperatureModel,
+        *,
+        fixed: bool,
+        check: Sequence[Priors] = (),
+    ) -> None:
+        self._mean, self._u = np.array(mean, dtype=float), np.array(standard_uncertainty, dtype=float)
+        self._priors, self._wander, self._temperature = [priors, *check], wander, temperature
+        self._fixed, self._place = fixed, 0
+        self.scale = scale_of(self._mean)
+        self._present = [""] * len(self._priors)  # the references by place
+        self._met: dict[str, Mounted] = {}  # every reference that was connected, last use last
+        self._used: list[str] = []  # the references of windows; the newest window's is the last
+        self._records: list[Record] = []
+        self._steps: list[Step] = []
+        self._dated: list[Dated] = []
+        self._over = OverFrequency()
+        self._held_mps2: Array | None = None  # mean input acceleration of a mount that never turned so far
+        self._now = self._solution().now
+        self._read: tuple[Now, str, Array, Array] | None = None  # what `_values` found
+        self._stated_then: Any = None  # what was stated when a loaded state was kept, if that is another now
+        self.windows = 0
+
+    # --- reading
+
+    @property
+    def statements(self) -> Statements:
+        """All that is stated."""
+        now = self._priors[0]
+        priors = {"": self._over.stated(now)}
+        for reference, met in self._met.items():
+            own = self._priors[met.place] if reference in self._present else now.with_values(met.stated)
+            priors[reference] = self._over.stated(own)
+        certified = {r: met.certified_day for r, met in self._met.items() if met.certified_day is not None}
+        places = {reference: met.place for reference, met in self._met.items()}
+        return Statements(
+            self._mean, self._u, priors, self._wander, self._temperature, places, certified, tuple(self._steps),
+            tuple(self._dated), self._held_mps2 if self._fixed else None,
+        )  # fmt: skip
+
+    def estimate(self) -> Estimate:
+        """The whole solution: the past and the budget as well."""
+        return self._solution()
+
+    def _solution(self, noise: Noise | None = None) -> Estimate:
+        also = [max(r.day for r in self._records)] if self._records else []
+        also += [step.day for step in self._steps if also and step.day > also[0]]
+        start = getattr(self, "_now", None) if self._records else None
+        return estimate(self._records, self.statements, start=start, also=also, noise=noise)
+
+    @property
+    def reference(self) -> str:
+        """The reference in use: that of the next windows."""
+        return self._present[self._place]
+
+    def innovation(self, record: Record, *, at_its_lag: bool = False) -> Innovation:
+        """What the window says against the state at its time.
+
+        `at_its_lag`: linearised at the lag that was taken out of the window, not at the state's, which may be too far.
+        """
+        return self._against(record, at_its_lag)[0]
+
+    def with_window(self, record: Record, *, at_its_lag: bool = False) -> tuple[Innovation, Self]:
+        """What the window says against the state at its time (see `innovation`), and a copy that has taken it."""
+        told, trial, ahead, rows = self._against(record, at_its_lag)
+        trial._take(record, ahead, rows)
+        return told, trial
+
+    def _against(self, record: Record, at_its_lag: bool) -> tuple[Innovation, Self, Now, Array]:
+        trial = self.copy()
+        ahead = trial._know(record)
+        at = None
+        if at_its_lag:
+            at = ahead.mean.copy()
+            if (k := ahead.unknowns.at.get(_lag_of(record.reference))) is not None:
+                at[k] = record.lag_s
+        rows = ahead.rows(record, at)
+        return ahead.says(rows), trial, ahead, rows
+
+    def _key(self, name: str) -> str:
+        """The key of an unknown of the sensor, its mount, or the reference in use by its name or its key."""
+        of = [f"{name} of {owner}" for owner in (self.reference, f"place {self._place}") if owner]
+        return next((key for key in (*of, name) if key in self._now), name)
+
+    @property
+    def lag_s(self) -> float:
+        """By how much the sensor is later than the reference; as stated before any window told."""
+        key = _lag_of(self.reference)
+        if key in self._now:
+            return float(self._now.mean[self._now.index(key)])
+        return self._priors[self._place].of(LAG.mean)
+
+    @property
+    def response(self) -> Response:
+        """The response of the sensor over that of the reference in use, to take out of the next window."""
+        before = (record.response for record in reversed(self._records) if record.reference == self.reference)
+        return self._over.response(self._now, self.reference, next(before, ()))
+
+    @property
+    def response_is_known(self) -> bool:
+        """Whether windows have told it: one more cannot change it much."""
+        return self._over.is_known(self._now, self.reference)
+
+    def response_is(self, taken: Response) -> bool:
+        """Whether it is the one that was taken out of a window, but for a part of its uncertainty."""
+        return self._over.is_taken_out(taken, self._now, self.reference)
+
+    def response_change(self, since: State) -> tuple[float, float]:
+        """The upper end of the motion in Hz, and by how much S is larger there than it was, relative."""
+        to_hz = self._over.motion_hz[1] if self._over.motion_hz else self._over.first_hz
+        now, before = (one._over.log_h(one._now, self.reference, to_hz) for one in (self, since))
+        return to_hz, float(np.expm1(now - before))
+
+    def has_another_response(self, than: State) -> bool:
+        """Whether the response beside the reference in use is surely another than in an earlier state."""
+        return self._over.differs(self._now, than._now, self.reference)
+
+    @property
+    def response_told(self) -> ResponseTold | None:
+        """What is known of it, by frequency; None where it is no unknown."""
+        return self._over.told(self._now, self.reference, self._priors[0], self.coverage_factor)
+
+    @property
+    def reference_frequency_hz(self) -> float:
+        """The frequency at which S holds; 0 if nothing moved yet."""
+        return self._over.reference_hz(self._priors[0])
+
+    @property
+    def motion_to_hz(self) -> float:
+        """Upper end of the motion that is used; inf before a window told a band that is wide enough for a response."""
+        return self._over.to_hz
+
+    @property
+    def determined(self) -> Flags:
+        """(12,) see calib.estimate.determined."""
+        return self._determined(*self._parameters())
+
+    def _determined(self, mean: Array, covariance: Array) -> Flags:
+        return determined(mean, np.sqrt(covariance.diagonal()), self._u, np.ones(12, dtype=bool))
+
+    def result(self) -> Calibration:
+        """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
+        mean, covariance = self._parameters()
+        freedom = self._now.noise.degrees_of_freedom or np.inf
+        told = self._determined(mean, covariance)
+        return Calibration(mean[:9].reshape(3, 3), mean[9:], covariance, told, freedom, METHOD)
+
+    @property
+    def covariance(self) -> Array:
+        """(12, 12) that of `result`."""
+        return self._parameters()[1]
+
+    @property
+    def coverage_factor(self) -> float:
+        """For about 95 % coverage."""
+        return self._now.coverage_factor
+
+    def _parameters(self) -> tuple[Array, Array]:
+        """S and Q (12,) and their covariance."""
+        mean, factor = self._values()
+        return mean[:12], np.asarray(factor[:12] @ factor[:12].T)
+
+    def _values(self) -> tuple[Array, Array]:
+        """All unknowns (N,) and a factor of their covariance, with what the response over frequency adds to it; Q where
+        the mean output of a fixed mount stands."""
+        if self._read is None or self._read[0] is not self._now or self._read[1] != self.reference:
+            now = self._now
+            mean, factor = now.mean.copy(), self._over.factor(now, self.reference, self._priors[0]).copy()
+            held = (r for r in reversed(self._records) if np.isfinite(r.held_mps2).all())
+            if self._fixed and self._held_mps2 is not None and (record := next(held, None)) is not None:
+                under, by = now.under_gravity(record)
+                S, away = mean[:9].reshape(3, 3), record.held_mps2 - self._held_mps2
+                by = by - np.kron(np.eye(3), away) @ np.eye(9, len(now))
+                mean[9:12] -= under - S @ away
+                factor[9:12] -= by @ factor
+            self._read = now, self.reference, mean, factor
+        return self._read[2], self._read[3]
+
+    def law(self, day: float | None = None) -> Law:
+        """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
+        if day is not None:
+            waited = self.copy()
+            waited._now = self._now.passed_to(day)
+            return waited.law()
+        temperature, now = self._temperature, self._now
+        order, rows = temperature.offset_order, temperature.sensitivity_order > 0
+        more = [now.index(quantity.key) for quantity, _ in temperature.terms(self.scale)]
+        chosen = [*range(12), *more]
+        mean, factor = (values[chosen] for values in self._values())
+        covariance, (low, high) = factor @ factor.T, self.temperature_range_degc
+        told, u_beyond = self._determined(mean[:12], covariance[:12, :12]), temperature.u_offset_mps2[1] * self.scale
+        return Law(mean, covariance, order, rows, self.reference_temperature_degc, low, high, u_beyond, told)
+
+    def quantity(self, name: str) -> tuple[float, float]:
+        """(value, u) of an unknown of the sensor, its mount or its present reference. Raises KeyError for another."""
+        now, key = self._now, self._key(name)
+        own = [now.index(key)]
+        quantity = now.unknowns.all[own[0]].quantity
+        if quantity.kind.since_certificate:  # the value at the beginning, and the walk since then
+            own.append(now.index(replace(quantity, centre=True).key))
+        return float(now.mean[own].sum()), float(np.linalg.norm(now.factor[own].sum(axis=0)))
+
+    @property
+    def residual_sd(self) -> Array:
+        """(3,) of single points in the newest window, output unit; NaN before any."""
+        return self._records[-1].noise.copy() if self._records else np.full(3, np.nan)
+
+    @property
+    def reference_temperature_degc(self) -> float:
+        """To which S and Q refer."""
+        return self._temperature.reference_degc
+
+    @property
+    def quantities(self) -> list[Quantity]:
+        """All unknowns, also those of references that are away."""
+        return self._now.quantities
+
+    @property
+    def present(self) -> list[Quantity]:
+        """All unknowns of the sensor, its mount and its present reference."""
+        owners = "", self.reference, f"place {self._place}"
+        return [q for q in self._now.quantities if q.owner in owners and not q.centre]
+
+    @property
+    def names(self) -> list[str]:
+        """Those of `present`."""
+        return [quantity.name for quantity in self.present]
+
+    @property
+    def drifts(self) -> list[tuple[str, float]]:
+        """(key, value) of the drift of each channel of the present reference, relative."""
+        own = [q for q in self.present if q.kind is REFERENCE_DRIFT]
+        return [(q.key, self.quantity(q.key)[0]) for q in own]
+
+    @property
+    def references(self) -> list[str]:
+        """References to whose errors S and Q owe their values; the newest window's is the last."""
+        return list(self._used)
+
+    @property
+    def shares(self) -> list[ReferenceShare]:
+        """What S and Q owe to the errors of each reference; that of the newest window is the last."""
+        factor = self._values()[1][:12]
+        return [share_in(self._now, factor, r, self._met[r].sensitivity if r in self._met else 1.0) for r in self._used]
+
+    @property
+    def temperature_range_degc(self) -> tuple[float, float]:
+        """Lowest and highest temperature of a window taken; NaN before any."""
+        return self._now.seen_degc
+
+    @property
+    def day(self) -> float | None:
+        """The day of the newest window; None before any."""
+        return max((r.days[1] for r in self._records), default=None)
+
+    @property
+    def chi2(self) -> float:
+        """The sum of squares of all rows: windows, walks, steps and priors."""
+        return self._now.chi2
+
+    def chi2_beside(self, records: Sequence[Record]) -> float:
+        """That of this state alone with the noise of these records pooled in: what `after` is compared with."""
+        return self._solution(Noise.of([*self._records, *records])).chi2
+
+    def changes(
+        self,
+        standard_uncertainty: Array,
+        tilt_rad: float = 0.0,
+        *,
+        u_rate: Array = STEADY,
+        line: bool = False,
+        another_filter: bool = False,
+    ) -> dict[str, float]:
+        """Standard uncertainties of a step, by key: of S and Q (12,), or of all `quantities` (N,), and of the tilt of a
+        fixed mount.
+
+        `u_rate` (12,): S and Q may drift by as much more a day. `line`: a device or its line may have begun anew, which
+        makes the lag another. `another_filter`: the response over frequency may be another.
+        """
+        u = {q.key: abs(float(s)) for q, s in zip(self.quantities, standard_uncertainty, strict=False) if s}
+        u |= {ALL_RATES[p]: abs(float(u_rate[p])) for p in np.flatnonzero(u_rate).tolist()}
+        stated = self.statements.of(self.reference)
+        for quantity in self.quantities:
+            of_it = () if quantity.centre else quantity.kind.loosened_by
+            if "lean" in of_it and self._fixed and tilt_rad:
+                u[quantity.key] = tilt_rad
+            elif quantity.owner == self.reference and (
+                (line and "line" in of_it) or (another_filter and "filter" in of_it)
+            ):
+                u[quantity.key] = stated.of(quantity.kind.prior)
+        return u
+
+    def after(self, records: Sequence[Record], u: Jump) -> Self:
+        """A copy that has taken these windows after a step just before the first of them (see `changes`)."""
+        trial = self.copy()
+        trial.take_also(records, [Step(float(np.nextafter(records[0].day, -np.inf)), dict(u))])
+        return trial
+
+    def copy(self) -> Self:
+        """An independent copy, to try windows on."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        other._present, other._met, other._used = list(self._present), dict(self._met), list(self._used)
+        other._records, other._steps, other._dated = list(self._records), list(self._steps), list(self._dated)
+        return other
+
+    # --- changing
+
+    def update(self, record: Record) -> None:
+        """Take a window."""
+        if self._records and np.floor(record.day) > np.floor(self._records[-1].day):
+            self._close(record.day)
+        ahead = self._know(record)
+        self._take(record, ahead, ahead.rows(record))
+
+    def _close(self, day: float) -> None:
+        """A day is over: old records are merged, and the whole is solved anew."""
+        cuts = [step.day for step in self._steps if any(not key.startswith("lag") for key in step.u)]
+        self._records = _newest(thinned(self._records, day, self._now.mean[:9].reshape(3, 3), cuts))
+        self.solve()
+
+    def solve(self) -> None:
+        """Everything anew, from the records and the statements."""
+        self._now = self._solution().now
+
+    def beyond(self, base: State) -> tuple[list[Record], list[Step]]:
+        """The windows and the steps that an earlier state does not have, of which this one is a copy that went on."""
+        kept = {id(record) for record in base._records}
+        return [r for r in self._records if id(r) not in kept], [s for s in self._steps if s not in base._steps]
+
+    def take_also(self, records: Sequence[Record], steps: Sequence[Step]) -> None:
+        """Take windows that were held, and the steps that they showed."""
+        self._steps = sorted([*self._steps, *steps], key=lambda step: step.day)
+        self._records = sorted([*self._records, *records], key=lambda record: record.day)
+        for record in records:
+            self._over = self._over.begun(record)
+            self._count(record)
+        self.solve()
+
+    def _know(self, record: Record) -> Now:
+        """The state at the time of a window, with the unknowns that no window had before."""
+        over, anew = self._over.begun(record), False
+        if over is not self._over:
+            self._over, anew = over, True
+        if self._fixed and np.isfinite(record.held_mps2).all():
+            if self._held_mps2 is None:
+                self._held_mps2, anew = record.held_mps2, True
+            elif not never_turned(np.array([self._held_mps2, record.held_mps2])):
+                self._fixed, anew = False, True  # the mount turned after all: from now on means tell Q and S alike
+        if anew:
+            if self._records:
+                self.solve()
+            else:
+                day = self._now.day if self.windows else record.day
+                self._now = estimate([], self.statements, also=[day]).now
+        elif not self._records and self._now.day < record.day:
+            self._now = estimate([], self.statements, also=[record.day]).now
+        return self._now.passed_to(record.day).meeting(record)
+
+    def _take(self, record: Record, ahead: Now, rows: Array) -> None:
+        self._records.append(record)
+        self._now = ahead.with_window(record, rows)
+        self._count(record)
+        if self._moved():
+            self.solve()
+
+    def _count(self, record: Record) -> None:
+        self._over = self._over.taken(record)
+        self._used = [r for r in self._used if r != record.reference] + [record.reference]
+        self.windows += 1
+
+    def _moved(self) -> bool:
+        """Whether an unknown is so far from where the windows were linearised that this must be done again."""
+        now = self._now
+        kinds = [quantity.kind for quantity in now.quantities]
+        straight = np.array([kind.straight * (self.scale if kind.in_output_unit else 1.0) for kind in kinds])
+        limit = np.maximum(straight, MOVED_U * np.sqrt(now.variance))
+        return bool(np.any(np.abs(now.mean - now.x) > limit)) or changed(now, now.x)
+
+    def step(self, u: Jump) -> None:
+        """From now on unknowns, by key, may be off by as much more."""
+        u = {key: size for key, size in u.items() if size > 0.0}
+        if not u or (last := self.day) is None:
+            return
+        day = float(np.nextafter(last, np.inf))
+        self._steps = [*self._steps, Step(day, u)]
+        if any(key not in self._now for key in u):
+            self.solve()
+        else:
+            self._now = replace(self._now.stepped(u), day=day)
+
+    def remount(self, *, of_reference: bool) -> None:
+        """The sensor was mounted again, or the reference in use was: what a mount decides may be another from now on.
+
+        The new value is the old one and a difference: as large as that of two independent values, since it may be.
+        """
+        owners = [self.reference, f"place {self._place}"] if of_reference else ["", *self._present]
+        owners += [] if of_reference else [f"place {place}" for place in range(len(self._present))]
+        priors = {unknown.key: unknown.u for unknown in self._now.unknowns.all}
+        self.step({
+            q.key: float(np.sqrt(2.0)) * priors[q.key]
+            for q in self.quantities
+            if q.owner in owners and not q.centre and (q.kind.of_reference or not of_reference)
+            and "remount" in q.kind.loosened_by
+        })  # fmt: skip
+        if not of_reference:
+            self._held_mps2 = None
+            self.solve()
+
+    def date_certificate(self, day: float | None) -> None:
+        """The date of the certificate of the reference in use; its drift counts from there. None: no date is stated."""
+        stated = {name: self._priors[self._place].values[name] for name in OF_REFERENCES}
+        met = self._met.get(self.reference) or Mounted(self._place, 1.0, None, stated)
+        first = not any(record.reference == self.reference for record in self._records)
+        if first:  # later the day of the same date differs by the rounding of clocks alone
+            self._met[self.reference] = replace(met, certified_day=day)
+            self._restated()
+
+    def _restated(self) -> None:
+        """The statements changed: the newest epoch takes them for the unknowns that come later."""
+        self._now = replace(self._now, unknowns=self._now.unknowns.with_statements(self.statements))
+
+    def use(self, place: int) -> None:
+        """The next windows are of the reference at this place. Both are mounted all the time: nothing is loosened."""
+        self._place = place
+
+    def meet(self, reference: str, calibrated: str = "", sensitivity: float = 1.0) -> bool:
+        """Another reference takes the place of the one in use. What is known of that one stays, and comes back with it.
+
+        `calibrated` is the date of its certificate, "" where none is stated: a reference that was calibrated again is
+        another one. `sensitivity` is that of its certificate. What the certificate states now holds for all windows of
+        this reference. Returns whether that changed S or Q.
+        """
+        owner = self._owner(reference, calibrated)
+        before, present = self._met.get(owner), self._present[self._place]
+        stated = {name: self._priors[self._place].values[name] for name in OF_REFERENCES}
+        met = Mounted(self._place, sensitivity, None if before is None else before.certified_day, stated)
+        if before == met and present == owner:
+            return False
+        self._present[self._place], self._met[owner] = owner, met
+        if before is not None and before.sensitivity != sensitivity:
+            times = before.sensitivity / sensitivity
+            self._records = [r.with_reference_times(times) if r.reference == owner else r for r in self._records]
+        known = any(record.reference == owner for record in self._records)
+        changed = known and before is not None and before != met
+        if changed:
+            was = self.result()
+            self.solve()
+            changed = not _same(was, self.result())
+        else:
+            self._restated()
+        if present not in ("", owner):
+            self.remount(of_reference=True)
+        return changed
+
+    def _owner(self, reference: str, calibrated: str) -> str:
+        """The reference with the date of its certificate, as an owner of unknowns."""
+        dated = f"{reference}{DATED}{calibrated}"
+        if calibrated and dated not in self._met and reference in self._met:
+            self._rename(reference, dated)  # the date of the same certificate was stated later
+        if calibrated:
+            return dated
+        return next((known for known in reversed(self._met) if known.startswith(reference + DATED)), reference)
+
+    def _rename(self, reference: str, dated: str) -> None:
+        self._met = {(dated if of == reference else of): met for of, met in self._met.items()}
+        self._present = [dated if of == reference else of for of in self._present]
+        self._used = [dated if of == reference else of for of in self._used]
+        self._records = [replace(r, reference=dated) if r.reference == reference else r for r in self._records]
+        end = f" of {reference}"
+        self._steps = [
+            replace(step, u={_renamed(key, end, f" of {dated}"): size for key, size in step.u.items()})
+            for step in self._steps
+        ]
+        self.solve()
+
+    def restate(self, gravity_mps2: tuple[float, float] | None = None) -> bool:
+        """After `load`: whether what is stated now of sensor and mount changed S or Q.
+
+        `gravity_mps2`: the local gravity as stated before and now, if that changed.
+        """
+        before = self.result()
+        if gravity_mps2 is not None:
+            ratio = gravity_mps2[1] / gravity_mps2[0]
+            self._records = [record.with_gravity(ratio) for record in self._records]
+            self._held_mps2 = None if self._held_mps2 is None else self._held_mps2 * ratio
+        elif self._stated_then is None:
+            return False
+        self._stated_then = None
+        self.solve()
+        return not _same(before, self.result())
+
+    def put(self, calibration: Calibration, day: float | None = None) -> None:
+        """S and Q as an operator wants them, on a day after the newest window; None: just after it. Older windows tell
+        nothing of S and Q from now on.
+
+        How the errors of the calibration depend on those of the nuisances is not known. So the variances of both are
+        doubled: the joint covariance is not too small, whatever the correlation is (covariance intersection with equal
+        weights; Julier and Uhlmann 1997).
+        """
+        values = np.append(calibration.sensitivity.ravel(), calibration.offset)
+        last, u = self.day, np.sqrt(self._now.variance)
+        loose = {q.key: float(np.sqrt(DOUBT)) * s for q, s in zip(self.quantities, u.tolist(), strict=True)}
+        flat = replace(self.statements, u=np.full(12, np.inf)).u_parameters
+        loose |= {q.key: s for q, s in zip(S_AND_Q, flat.tolist(), strict=True)}
+        if day is None:
+            day = self._now.day if last is None else float(np.nextafter(last, np.inf))
+        self._steps = [*self._steps, Step(day, loose)]
+        self._held_mps2 = None  # Q is known again; the next window of a fixed mount makes the mean output of it
+        self._dated = [*self._dated, Dated(day, values, (1.0 + DOUBT) * calibration.covariance)]
+        self.solve()
+
+    # --- state
+
+    def _stated(self) -> list[Any]:
+        temperature = asdict(self._temperature)
+        u_offset = list(temperature.pop("u_offset_mps2"))
+        priors = [[dict(own.values), repr(own.known)] for own in self._priors]
+        return [self._mean.tolist(), self._u.tolist(), priors, dict(self._wander.values), temperature, u_offset]
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that changes, exactly."""
+        return {
+            "records": [record.snapshot() for record in self._records],
+            "steps": [asdict(step) for step in self._steps],
+            "dated": [{"day": d.day, "mean": d.mean, "covariance": d.covariance} for d in self._dated],
+            "present": list(self._present),
+            "met": {reference: asdict(met) for reference, met in self._met.items()},
+            "used": list(self._used),
+            "over": self._over.snapshot(),
+            "held_mps2": self._held_mps2,
+            "fixed": self._fixed,
+            "now": self._now.snapshot(),
+            "stated": self._stated(),
+            "windows": self.windows,
+        }
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Go on from a snapshot. Where it was made with other statements, `restate` and `meet` must follow."""
+        self._place = 0
+        self._records = [Record.load(record) for record in state["records"]]
+        self._steps = [Step(**step) for step in state["steps"]]
+        self._dated = [Dated(d["day"], np.array(d["mean"]), np.array(d["covariance"])) for d in state["dated"]]
+        for place, reference in enumerate(state["present"][: len(self._present)]):
+            self._present[place] = reference
+        self._met = {reference: Mounted(**met) for reference, met in state["met"].items()}
+        self._used = list(state["used"])
+        self._over = OverFrequency.load(state["over"])
+        self._held_mps2 = None if state["held_mps2"] is None else np.array(state["held_mps2"])
+        self._fixed = self._fixed and state["fixed"]  # a mount that turned once is fixed no more
+        self.windows = state["windows"]
+        self._now = Now.load(state["now"], self.statements, self._records)
+        self._stated_then = None if state["stated"] == self._stated() else state["stated"]
+
+
+def _newest(records: Sequence[Record]) -> list[Record]:
+    """Those of the positions and of the references that were used last: each has unknowns of its own."""
+    positions = list(dict.fromkeys(r.pose.position for r in reversed(records)))[:MOST_POSITIONS]
+    references = list(dict.fromkeys(r.reference for r in reversed(records)))[:MOST_REFERENCES]
+    return [r for r in records if r.pose.position in positions and r.reference in references]
+
+
+def _lag_of(reference: str) -> str:
+    return Quantity("lag", LAG, owner=reference).key
+
+
+def _renamed(key: str, end: str, new: str) -> str:
+    for tail in (end, f"{end}, centre"):
+        if key.endswith(tail):
+            return key[: -len(tail)] + tail.replace(end, new)
+    return key
+
+
+def _same(one: Calibration, other: Calibration) -> bool:
+    alike = np.array_equal(one.sensitivity, other.sensitivity) and np.array_equal(one.offset, other.offset)
+    return bool(alike and np.array_equal(one.covariance, other.covariance))

@@ -1,0 +1,119 @@
+"""Old records are merged: many windows of one setting become one record, which tells the same of all that is constant.
+
+A walk within the merged stretch is allowed for in the record's weight (calib.estimate.rows). Nothing is merged across a
+step, nor what differs in setting, in the directions that moved or in the response that the front end took out; lags are
+brought to one. A record without a temperature stays apart from those that have one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.estimate.deviations import Deviations, LeftOpen
+from calib.estimate.record import TERMS, TOLD, Record
+from calib.model import Array
+
+NEWEST = 48  # records that stay as they are: four times round twelve positions
+# (age in days from which on, width in days): an hour for two weeks, then longer ones.
+WIDTHS = ((0.0, 1.0 / 24.0), (14.0, 1.0), (60.0, 7.0), (400.0, 30.0), (1200.0, 365.0))
+BIN_K = 10.0  # records whose temperatures differ by more stay apart: S may depend on it
+
+
+def thinned(records: Sequence[Record], now: float, nominal: Array, cuts: Sequence[float] = ()) -> list[Record]:
+    """The records, in the order of their days, the old ones merged as WIDTHS says.
+
+    `nominal` (3, 3) is S, only to bring the means of V to one mean of the reference's motion. `cuts`: days of steps.
+    """
+    records = sorted(records, key=lambda r: r.day)
+    old, new = records[:-NEWEST], records[-NEWEST:]
+    buckets: dict[tuple[object, ...], list[Record]] = {}
+    for r in old:
+        width = max(width for age, width in WIDTHS if now - r.day >= age or age == 0.0)
+        degc = np.floor(r.temperature_degc / BIN_K) if np.isfinite(r.temperature_degc) else None
+        key = (
+            width, int(r.day // width), sum(r.day >= day for day in cuts), r.setting, r.excited.tobytes(), r.response,
+            degc, r.motion_hz is None,
+        )  # fmt: skip
+        buckets.setdefault(key, []).append(r)
+    return sorted((merged(own, nominal) for own in buckets.values()), key=lambda r: r.day) + new
+
+
+def merged(records: Sequence[Record], nominal: Array) -> Record:
+    """One record for several of one setting and response."""
+    if len(records) == 1:
+        return records[0]
+    first, m2 = records[0], 2 * records[0].channels
+    windows = np.array([float(r.windows) for r in records])
+    share = windows / windows.sum()
+
+    def mean(name: str) -> Array:
+        return np.asarray(sum(w * getattr(r, name) for w, r in zip(share, records, strict=True)))
+
+    noise = np.sqrt(sum(w * r.noise**2 for w, r in zip(share, records, strict=True)))
+    root, slopes, passed, left, rank = _stacked(records, noise, m2)
+    mean_x = mean("mean_x")
+    D = first.pose.direction
+    # The means of V at one mean of the reference: its own motion moves them by S as nearly as nominal.
+    moved = [r.means - np.outer(r.over_t[:, 0], nominal @ D @ (r.mean_x - mean_x)[: D.shape[1]]) for r in records]
+    over = _triangle(np.hstack([np.vstack([r.over_t for r in records]), np.vstack(moved)]), 3)
+    power = np.array([(r.root[:, : r.channels] ** 2).sum() for r in records]) + np.finfo(float).tiny
+    freedom = np.array([r.freedom for r in records])
+    by = freedom / freedom.sum() if freedom.sum() else share
+    deviations, left_open = Deviations(), LeftOpen()
+    for r in records:
+        deviations, left_open = deviations.plus(r.deviations), left_open.plus(r.left_open)
+    return replace(
+        first,
+        day=float(share @ [r.day for r in records]),
+        days=(min(r.days[0] for r in records), max(r.days[1] for r in records)), windows=int(windows.sum()),
+        u_lag_s=_rms(share, [r.u_lag_s for r in records]), attenuation=_rms(share, [r.attenuation for r in records]),
+        independent=float(share @ [r.independent for r in records]), along=mean("along"),
+        along_rate_s=mean("along_rate_s"), root=root, slopes=slopes, passed=passed,
+        omega2=float(power @ [r.omega2 for r in records] / power.sum()), noise=noise,
+        ratio=np.asarray(sum(w * r.ratio for w, r in zip(by, records, strict=True))), freedom=float(freedom.sum()),
+        mean_x=mean_x, means=over[:, 3:], over_t=over[:, :3],
+        temperature_degc=float(share @ [r.temperature_degc for r in records]), held_mps2=mean("held_mps2"),
+        count=float(sum(r.count for r in records)), told=_triangle(np.vstack([r.told for r in records]), TOLD),
+        deviations=deviations, left_open=left_open, mean_hz=float(share @ [r.mean_hz for r in records]),
+        misfit=(
+            sum(r.misfit[0] for r in records) + float(np.sum((left / noise) ** 2)),
+            sum(r.misfit[1] for r in records) + 3.0 * rank * (len(records) - 1),
+        ),
+    )  # fmt: skip
+
+
+def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, Array, Array, Array, int]:
+    """R, R b and R P of all together, what the slopes differ by (r, 3), and the rank of R.
+
+    A window's rows count by its own noise, as if all had the noise of the merged one.
+    """
+    half, lag_s = m2 // 2, records[0].lag_s
+    by = [float(np.sqrt(np.mean(noise**2 / r.noise**2))) for r in records]
+    wide = np.vstack([
+        b * np.hstack([r.root, r.slopes_at_lag(lag_s), r.passed.transpose(1, 0, 2).reshape(m2, -1)])
+        for b, r in zip(by, records, strict=True)
+    ])  # fmt: skip
+    live = np.abs(wide[:, :m2]).max(axis=0, initial=0.0) > 0.0
+    triangle = np.asarray(np.linalg.qr(np.hstack([wide[:, :m2][:, live], wide[:, m2:]]), mode="r"))
+    k, found = int(live.sum()), np.zeros((m2, wide.shape[1]))
+    found[np.ix_(live, live)], found[live, m2:] = triangle[:k, :k], triangle[:k, k:]
+    passed = found[:, m2 + 3 :].reshape(m2, TERMS, half).transpose(1, 0, 2)
+    return found[:, :m2], found[:, m2 : m2 + 3], passed, triangle[k : k + 3, k : k + 3], k
+
+
+def _triangle(rows: Array, most: int) -> Array:
+    """The first rows of the R factor, `most` of them, in which columns of zeros stay so."""
+    found = np.zeros((min(most, len(rows)), rows.shape[1]))
+    live = np.abs(rows).max(axis=0, initial=0.0) > 0.0
+    if live.any():
+        triangle = np.asarray(np.linalg.qr(rows[:, live], mode="r"))[:most]
+        found = np.zeros((len(triangle), rows.shape[1]))
+        found[:, live] = triangle
+    return found
+
+
+def _rms(share: Array, values: Sequence[float]) -> float:
+    return float(np.sqrt(share @ np.square(values)))

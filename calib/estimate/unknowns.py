@@ -1,0 +1,303 @@
+"""The unknowns of an estimate: their priors, how they change with time, and how they act on a window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.estimate import physics
+from calib.estimate import quantities as kinds
+from calib.estimate.chain import Passage
+from calib.estimate.quantities import (
+    ALL_RATES,
+    MAIN_TEMPERATURE,
+    OFFSET_RATE,
+    RATES,
+    S_AND_Q,
+    SENSITIVITY_RATE,
+    YEAR_DAYS,
+    Quantity,
+    offset_temperature,
+)
+from calib.estimate.record import Record
+from calib.estimate.statements import FLAT, Dated, Statements
+from calib.estimate.terms import Term, terms
+from calib.model import Array
+
+EXACT = 1e-9  # standard uncertainty, relative to the scale, of what is known exactly
+LEAST_KEPT = 1e-6  # of its distance from the centre, what a bounded walk keeps over the longest pause
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """One of them: its prior on the day `since`, and the variance a day of its random walk from then on.
+
+    The walk is a Gauss-Markov process about its centre, whose variance never exceeds `bound`. The centre is the mean of
+    the prior, or for S and Q, where these have steps or rates, an unknown of its own, which these move as well.
+    """
+
+    quantity: Quantity
+    mean: float
+    u: float
+    since: float
+    a_day: float = 0.0
+    bound: float = np.inf
+
+    @property
+    def key(self) -> str:
+        """Identifies it."""
+        return self.quantity.key
+
+    def relaxed(self, days: float) -> tuple[float, float]:
+        """The part of its distance from the centre that it keeps over so many days, and the variance it gains."""
+        gained = self.a_day * days
+        if not np.isfinite(self.bound) or gained == 0.0:
+            return 1.0, gained
+        kept = max(float(np.exp(-0.5 * gained / self.bound)), LEAST_KEPT)
+        return kept, self.bound * (1.0 - kept**2)
+
+
+class Unknowns:
+    """All unknowns of some records under some statements: N of them, S and Q (12) first."""
+
+    def __init__(self, statements: Statements, records: Sequence[Record]) -> None:
+        self.statements = statements
+        self.begin = min((*(r.days[0] for r in records), *(d.day for d in statements.dated)), default=0.0)
+        self.all: list[Unknown] = []
+        self.at: dict[str, int] = {}
+        self._terms: dict[tuple[object, ...], list[Term]] = {}
+        self._effects: dict[tuple[object, ...], Array] = {}
+        self._taken_out: dict[tuple[object, ...], Array] = {}
+        self._add(self._of_sensor())
+        for record in records:
+            self.meet(record)
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    def __contains__(self, setting: object) -> bool:
+        """Whether the unknowns of records with this setting are here."""
+        return setting in self._terms
+
+    def meet(self, record: Record) -> list[Unknown]:
+        """The unknowns of a record that were not there before, which come in with their priors."""
+        if record.setting in self._terms:
+            return []
+        self._terms[record.setting] = self._terms_of(record)
+        self._effects.clear()
+        self._taken_out.clear()
+        return self._add(found for t in self._terms[record.setting] for found in self._of_term(t, record))
+
+    def _terms_of(self, record: Record) -> list[Term]:
+        own = terms([record.pose], record.channels, self.statements.of(record.reference), {}, record.reference)
+        return [replace(t, quantity=self.placed(t.quantity)) for t in own if t.uncertainty > 0.0]
+
+    def with_statements(self, statements: Statements) -> Unknowns:
+        """The same unknowns; those that are met later come in with other statements."""
+        other = copy(self)
+        other.statements = statements
+        other.all, other.at, other._terms = list(self.all), dict(self.at), dict(self._terms)
+        other._effects, other._taken_out = {}, {}
+        return other
+
+    @classmethod
+    def loaded(cls, statements: Statements, records: Sequence[Record], all_: Iterable[Unknown]) -> Unknowns:
+        """Those of a snapshot, in their order. What is an unknown only by the statements of now is none."""
+        found = object.__new__(cls)
+        found.statements = statements
+        found.begin = min((*(r.days[0] for r in records), *(d.day for d in statements.dated)), default=0.0)
+        found.all, found.at, found._terms, found._effects, found._taken_out = [], {}, {}, {}, {}
+        found._add(all_)
+        for record in records:
+            if record.setting not in found:
+                found._terms[record.setting] = [t for t in found._terms_of(record) if t.key in found.at]
+        return found
+
+    def placed(self, quantity: Quantity) -> Quantity:
+        """A quantity of the place of a reference is that of the place, whichever reference stands there."""
+        if not quantity.kind.of_place:
+            return quantity
+        return replace(quantity, owner=f"place {self.statements.places.get(quantity.owner, 0)}")
+
+    def _add(self, found: Iterable[Unknown]) -> list[Unknown]:
+        new = []
+        for unknown in found:
+            if unknown.key not in self.at:
+                self.at[unknown.key] = len(self.all)
+                self.all.append(unknown)
+                new.append(unknown)
+        return new
+
+    def _of_sensor(self) -> Iterable[Unknown]:
+        s, begin = self.statements, self.begin
+        stepping = {key for step in s.steps for key in step.u}
+        # A tilt moves the mean output of a mount that never turns.
+        tilted_mps2 = 0.0 if s.held_mps2 is None else float(np.linalg.norm(s.held_mps2))
+        unknowns, walks = [], s.wander.variance_a_day(s.scale, tilted_mps2)
+        for k, (quantity, stated) in enumerate(zip(S_AND_Q, s.u_parameters.tolist(), strict=True)):
+            u = max(stated, EXACT * s.scale)
+            bound = u**2 if u < 0.5 * FLAT * s.scale else np.inf
+            own = Unknown(quantity, float(s.mean[k]), u, begin, float(walks[k]), bound)
+            unknowns.append(own)
+        yield from unknowns
+        rate_u, rate_walk = (s.wander.of(w) * s.scale for w in (OFFSET_RATE.prior, OFFSET_RATE.walk))
+        for name in ALL_RATES:
+            if name in RATES:
+                yield Unknown(
+                    Quantity(name, OFFSET_RATE), 0.0, rate_u or EXACT * s.scale, begin, rate_walk**2, rate_u**2
+                )
+            elif name in stepping:
+                yield Unknown(Quantity(name, SENSITIVITY_RATE), 0.0, EXACT * s.scale, begin)
+        for own, rate in zip(unknowns, ALL_RATES, strict=True):
+            if own.a_day and np.isfinite(own.bound) and (rate in RATES or stepping & {own.key, rate}):
+                yield Unknown(replace(own.quantity, centre=True), own.mean, EXACT * s.scale, begin)
+        for quantity, u in s.temperature.terms(s.scale):
+            yield Unknown(quantity, 0.0, u, begin)
+
+    def _of_term(self, t: Term, record: Record) -> Iterable[Unknown]:
+        s, since, kind = self.statements, record.days[0], t.kind
+        u, walk = t.uncertainty, s.wander.of(kind.walk)
+        if kind.since_certificate:
+            walk = u / np.sqrt(YEAR_DAYS)
+            years = max(since - s.certified.get(record.reference, since), 0.0) / YEAR_DAYS
+            # The value at the beginning stays, beside the walk since then: what S owes to it is told (reference_share).
+            yield Unknown(replace(t.quantity, centre=True), t.expected, max(u * np.sqrt(years), EXACT), since)
+            yield Unknown(t.quantity, 0.0, EXACT, since, float(walk**2))
+            return
+        bound = 4.0 * u**2  # later the mount may lean by more than its prior says of the day of mounting
+        yield Unknown(t.quantity, t.expected, u, since, float(walk**2), bound if walk else np.inf)
+
+    @property
+    def prior(self) -> tuple[Array, Array]:
+        """Means and standard uncertainties (N,) before any data; with the steps of before the first window."""
+        u = np.array([unknown.u for unknown in self.all])
+        for step in self.statements.steps:
+            if step.day <= self.begin:
+                for key, more in step.u.items():
+                    if (k := self.at.get(key)) is not None:
+                        u[k] = np.hypot(u[k], more)
+        return np.array([unknown.mean for unknown in self.all]), u
+
+    def passage(self, before: float, after: float) -> tuple[Array, Array, Passage]:
+        """From one day to another: F (N, N), f (N,) of x' = F x + f, and the passage with the gap 0."""
+        size, s, days = len(self.all), self.statements, max(after - before, 0.0)
+        follows, shift, noises = np.eye(size), np.zeros(size), []
+        for k, own in enumerate(self.all):
+            if own.a_day == 0.0:
+                continue
+            kept, variance = own.relaxed(max(after - max(before, own.since), 0.0))
+            follows[k, k] = kept
+            if kept < 1.0:
+                if (centre := self._centre(own.quantity)) is not None:
+                    follows[k, centre] = 1.0 - kept
+                else:
+                    shift[k] = (1.0 - kept) * own.mean
+            if variance > 0.0:
+                noises.append(np.sqrt(variance) * np.eye(size)[k])
+        for quantity, name in zip(S_AND_Q, ALL_RATES, strict=True):
+            if (rate := self.at.get(name)) is not None:
+                follows[self.at[quantity.key], rate] += days
+                if (centre := self._centre(quantity)) is not None:
+                    follows[centre, rate] += days
+        for step in s.steps:
+            if before < step.day <= after:
+                noises += self.stepped(step.u)
+        noise = np.array(noises).reshape(-1, size).T
+        back = np.asarray(np.linalg.inv(follows), dtype=np.float64)
+        return follows, shift, Passage(back, np.zeros(size), noise)
+
+    def _centre(self, quantity: Quantity) -> int | None:
+        return None if quantity.kind.since_certificate else self.at.get(replace(quantity, centre=True).key)
+
+    def stepped(self, u: Mapping[str, float]) -> list[Array]:
+        """The changes (N,) of one standard uncertainty each that a step makes; its centre moves with S or Q."""
+        found = []
+        for key, size in u.items():
+            if size > 0.0 and (k := self.at.get(key)) is not None:
+                change = np.zeros(len(self.all))
+                change[k] = size
+                if (centre := self._centre(self.all[k].quantity)) is not None:
+                    change[centre] = size
+                found.append(change)
+        return found
+
+    def dated(self, stated: Dated, x: Array) -> Array:
+        """Rows (12, N + 1) of a calibration that an operator put in force, at the values x (N,)."""
+        values, ways = np.linalg.eigh(stated.covariance)
+        white = (ways / np.sqrt(np.maximum(values, np.finfo(float).tiny))).T
+        values_of = np.eye(12)  # S and Q by S and, where it stands in the place of Q, the mean output
+        if (held := self.statements.held_mps2) is not None:
+            values_of[9:, :9] = -np.kron(np.eye(3), held)
+        rows = np.zeros((12, len(self.all) + 1))
+        rows[:, :12], rows[:, -1] = white @ values_of, white @ (stated.mean - values_of @ x[:12])
+        return rows
+
+    # --- effects on a window
+
+    def effect(self, record: Record, epoch_day: float) -> tuple[Array, Array]:
+        """(SIZE, N) of one unit of each unknown on the inputs of a window (calib.estimate.physics), and (N,) what its
+        front end took out, at an epoch that has this day."""
+        if record.setting not in self._effects:
+            self._effects[record.setting] = self._effect(record)
+        effect, away = self._effects[record.setting], record.day - epoch_day
+        if away:
+            effect = effect.copy()
+            for p, name in enumerate(ALL_RATES):
+                if (rate := self.at.get(name)) is not None:
+                    effect[:, rate] += away * effect[:, p]
+        key = record.setting, record.lag_s, record.response
+        if key not in self._taken_out:
+            self._taken_out[key] = self._found_taken_out(record)
+        return effect, self._taken_out[key]
+
+    def _found_taken_out(self, record: Record) -> Array:
+        found, priors = np.zeros(len(self.all)), self.statements.of(record.reference)
+        values = {
+            kinds.LAG: (record.lag_s,), kinds.RESPONSE: record.response,
+            kinds.REFERENCE_CORNER: (priors.reference_corner_at_hz,),
+            kinds.SENSOR_CORNER: (priors.sensor_corner_at_hz,),
+        }  # fmt: skip
+        for t in self._terms[record.setting]:
+            found[self.at[t.key]] = t.with_applied(values).applied
+        return found
+
+    def _effect(self, record: Record) -> Array:
+        found = np.zeros((physics.SIZE, len(self.all)))
+        found[physics.S, :9], found[physics.Q, 9:12] = np.eye(9), np.eye(3)
+        found[physics.STRETCH] += self._named(MAIN_TEMPERATURE)
+        found[physics.OVER_T] += np.vstack([self._named(offset_temperature(power)) for power in (1, 2)])
+        for t in self._terms[record.setting]:
+            own = self._of_one(t)
+            found[:, self.at[t.key]] += own
+            if t.kind.since_certificate:
+                found[:, self.at[replace(t.quantity, centre=True).key]] += own
+        return found
+
+    def _named(self, names: Sequence[str]) -> Array:
+        """(len(names), N) ones where unknowns of these names are."""
+        found = np.zeros((len(names), len(self.all)))
+        for row, name in enumerate(names):
+            if name in self.at:
+                found[row, self.at[name]] = 1.0
+        return found
+
+    def _of_one(self, t: Term) -> Array:
+        """(SIZE,) the effect of one unit of a nuisance."""
+        found = np.zeros(physics.SIZE)
+        for where, what in (
+            (physics.TURN, t.turn_direction), (physics.TURN_GRAVITY, t.turn_gravity), (physics.ACROSS, t.transverse),
+            (physics.AHEAD, t.quadrature), (physics.LAG, t.lag), (physics.GRAVITY, t.gravity),
+            (physics.REFERENCE, None if t.reference is None else t.reference[:3]), (physics.RESPONSE, t.response),
+        ):  # fmt: skip
+            if what is not None:
+                own = np.ravel(what)
+                found[where.start : where.start + len(own)] += own
+        if t.offset is not None:
+            found[physics.Q] += self.statements.scale * t.offset[0]
+        for sign, corner in ((1.0, t.reference_corner), (-1.0, t.sensor_corner)):
+            if corner is not None:
+                found[physics.CORNER] += sign * corner[0] / (2.0 * np.pi)
+        return found
