@@ -170,6 +170,8 @@ class Estimation:
         self, window: Window, day: float, lag_s: float, temperature_degc: float, anew: Anew | None = None
     ) -> Judged:
         """Take, hold or refuse one used window. `anew`: the search that found its lag, if there was one."""
+        if self.state.close_day(day):
+            self._tried = None
         if anew is None:
             tried = self._tried_of(window, day, lag_s, temperature_degc)
         else:

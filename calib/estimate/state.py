@@ -93,6 +93,7 @@ class State:
         self._now = self._solution().now
         self._read: tuple[Now, str, Array, Array] | None = None  # what `_values` found
         self._stated_then: Any = None  # what was stated when a loaded state was kept, if that is another now
+        self._newest_day: int | None = None  # of the data; None before any window
         self.windows = 0
 
     # --- reading
@@ -382,16 +383,20 @@ class State:
 
     def update(self, record: Record) -> None:
         """Take a window."""
-        if self._records and np.floor(record.day) > np.floor(self._records[-1].day):
-            self._close(record.day)
+        self.close_day(record.day)
         ahead = self._know(record)
         self._take(record, ahead, ahead.rows(record))
 
-    def _close(self, day: float) -> None:
-        """A day is over: old records are merged, and the whole is solved anew."""
+    def close_day(self, day: float) -> bool:
+        """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns
+        whether that was done."""
+        if self._newest_day is None or np.floor(day) <= self._newest_day:
+            return False
+        self._newest_day = int(np.floor(day))
         cuts = [step.day for step in self._steps if any(not key.startswith("lag") for key in step.u)]
         self._records = _newest(thinned(self._records, day, self._now.mean[:9].reshape(3, 3), cuts))
         self.solve()
+        return True
 
     def solve(self) -> None:
         """Everything anew, from the records and the statements."""
@@ -441,6 +446,8 @@ class State:
     def _count(self, record: Record) -> None:
         self._over = self._over.taken(record)
         self._used = [r for r in self._used if r != record.reference] + [record.reference]
+        day = int(np.floor(record.day))
+        self._newest_day = day if self._newest_day is None else max(self._newest_day, day)
         self.windows += 1
 
     def _moved(self) -> bool:
@@ -606,6 +613,7 @@ class State:
             "fixed": self._fixed,
             "now": self._now.snapshot(),
             "stated": self._stated(),
+            "newest_day": self._newest_day,
             "windows": self.windows,
         }
 
@@ -622,7 +630,7 @@ class State:
         self._over = OverFrequency.load(state["over"])
         self._held_mps2 = None if state["held_mps2"] is None else np.array(state["held_mps2"])
         self._fixed = self._fixed and state["fixed"]  # a mount that turned once is fixed no more
-        self.windows = state["windows"]
+        self._newest_day, self.windows = state["newest_day"], state["windows"]
         self._now = Now.load(state["now"], self.statements, self._records)
         self._stated_then = None if state["stated"] == self._stated() else state["stated"]
 

@@ -209,3 +209,18 @@ def test_a_snapshot_in_the_midst_of_a_jump_goes_on_bit_for_bit() -> None:
     for found in (going_on, other):
         assert actions(hours(found, windows[3:], first=13)) == ["hold", "adopt"] + ["take"] * 4
     assert pack(other.snapshot()) == pack(going_on.snapshot())
+
+
+def test_old_windows_are_merged_while_it_runs_and_judging_goes_on() -> None:
+    """A window each 18 minutes: at the end of a day all but the newest 48 become one an hour."""
+    random = np.random.default_rng(15)
+    found = estimation()
+    made = [building_window(random) for _ in range(10)]
+    numbers = range(0, 160)
+    for k in numbers:
+        window = made[k % 10]
+        assert found.judge(window, k / 80.0, 0.0, 20.0).decision.action == "take"
+    kept = found.snapshot()["state"]["records"]
+    assert found.state.windows == len(numbers)
+    assert len(kept) == 48 + 10 + 80  # 32 windows of the first day in ten hours; 48 of it as they were; those of today
+    assert sum(record["windows"] for record in kept) == len(numbers)
