@@ -216,7 +216,7 @@ def test_old_windows_are_merged_while_it_runs_and_judging_goes_on() -> None:
     random = np.random.default_rng(15)
     found = estimation()
     made = [building_window(random) for _ in range(10)]
-    numbers = range(0, 160)
+    numbers = range(160)
     for k in numbers:
         window = made[k % 10]
         assert found.judge(window, k / 80.0, 0.0, 20.0).decision.action == "take"
