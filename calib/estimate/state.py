@@ -26,7 +26,7 @@ from calib.estimate.record import Record
 from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
 from calib.estimate.rows import Noise
-from calib.estimate.statements import Dated, Statements, Step
+from calib.estimate.statements import DOUBT, Dated, Statements, Step
 from calib.estimate.thinning import thinned
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array, Calibration, scale_of
@@ -44,7 +44,6 @@ OF_REFERENCES = [  # what belongs to a place is as it is stated now, whichever r
     if s.name in PRIORS
 ]
 MOVED_U = 0.3  # standard uncertainties: what is not linear within so little is far below u
-DOUBT = 1.0  # times its variance that every unknown is less certain where its correlation with S and Q was lost
 Jump = Mapping[str, float]
 
 
@@ -576,8 +575,8 @@ class State:
         nothing of S and Q from now on.
 
         How the errors of the calibration depend on those of the nuisances is not known. So the variances of both are
-        doubled: the joint covariance is not too small, whatever the correlation is (covariance intersection with equal
-        weights; Julier and Uhlmann 1997).
+        doubled, also of nuisances that come later: the joint covariance is not too small, whatever the correlation is
+        (covariance intersection with equal weights; Julier and Uhlmann 1997).
         """
         values = np.append(calibration.sensitivity.ravel(), calibration.offset)
         last, u = self.day, np.sqrt(self._now.variance)

@@ -18,6 +18,7 @@ from calib.model import Array, scale_of
 
 FLAT = 1e4  # standard uncertainty, relative to the scale, of what nobody knows
 FLAT_OFFSET_MPS2 = 1e5  # the same, of Q
+DOUBT = 1.0  # times its variance that an unknown is less certain where its correlation with S and Q was lost
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from calib.estimate.quantities import (
     offset_temperature,
 )
 from calib.estimate.record import Record
-from calib.estimate.statements import FLAT, Dated, Statements
+from calib.estimate.statements import DOUBT, FLAT, Dated, Statements
 from calib.estimate.terms import Term, terms
 from calib.model import Array
 
@@ -160,6 +160,8 @@ class Unknowns:
     def _of_term(self, t: Term, record: Record) -> Iterable[Unknown]:
         s, since, kind = self.statements, record.days[0], t.kind
         u, walk = t.uncertainty, s.wander.of(kind.walk)
+        if any(stated.day <= since for stated in s.dated):  # S and Q may owe their errors to this one
+            u *= float(np.sqrt(1.0 + DOUBT))
         if kind.since_certificate:
             walk = u / np.sqrt(YEAR_DAYS)
             years = max(since - s.certified.get(record.reference, since), 0.0) / YEAR_DAYS

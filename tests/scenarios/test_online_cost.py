@@ -11,7 +11,7 @@ from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
 
 WINDOWS = 170
-EARLY, LATE = range(60, 70), range(160, 170)  # of one day; the newest 48 windows and one record an hour are kept
+EARLY, LATE = range(60, 70), range(150, 160)  # of one day; the newest 48 windows and one record an hour are kept
 LARGEST = 1_500_000  # bytes of a state with a record an hour for two weeks, of which 170 are here
 
 

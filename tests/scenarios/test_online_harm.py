@@ -62,7 +62,8 @@ def test_harmless_windows_are_taken() -> None:
     assert windows >= 12 * harm.TIMING.windows
     # A test at 95 % would refuse about seven of 144 windows; the agent holds one good window in 10,000.
     assert used >= windows - 2
-    assert all(o.updates == o.used for o in outcomes)
+    # A first window that lasts less than 10 s alone puts nothing in force.
+    assert all(o.used - 1 <= o.updates <= o.used for o in outcomes)
     assert {o.status for o in outcomes} == {"VALID"}
 
 
