@@ -32,13 +32,17 @@ def for_each(work: Callable[[Path], T], paths: Sequence[Path], jobs: int) -> Ite
 
 
 def _pool(jobs: int) -> ProcessPoolExecutor | None:
-    """So many processes; None where one is enough, or where the system has no semaphores (no /dev/shm)."""
+    """So many processes; None where one is enough, or where the system has no semaphores (no /dev/shm).
+
+    They come from a server without threads: a copy of this process could wait for ever for a lock that a thread of a
+    library held when it was made.
+    """
     if jobs < 2:
         return None
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
     try:
-        return ProcessPoolExecutor(jobs, mp_context=get_context("fork"))
+        return ProcessPoolExecutor(jobs, mp_context=get_context("forkserver"))
     except (OSError, ImportError, ValueError):
         return None
