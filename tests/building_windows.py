@@ -1,4 +1,4 @@
-"""Windows of a sensor beside a tri-axial AC-coupled reference at a fixed mount, with known truth, for the recursion."""
+"""Windows of a sensor beside a tri-axial AC-coupled reference at a fixed mount, with known truth, for the state."""
 
 from __future__ import annotations
 

@@ -103,12 +103,11 @@ class Times:
         """Find the unit and the usual step by the first times."""
         steps = np.diff(raw)
         self._first = self._last = float(raw[0])
-        self._usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+        forward = steps[steps > 0]
+        self._usual = float(np.median(forward)) if len(forward) else 0.0
         if self._guesses:
             self._guess_unit()
-        forward = steps[steps > 0]
-        mean = float(forward.sum()) / max(len(steps), 1)
-        self._period_s = mean * self._second
+        self._period_s = float(forward.sum()) / max(len(steps), 1) * self._second
 
     def _guess_unit(self) -> None:
         path, first = self._source.path, self._first

@@ -50,13 +50,12 @@ _SOME = 3  # places at most that are named for a setting
 def in_words(fault: Mapping[str, Any], path: Path) -> str:
     """What is wrong by a fault of pydantic at this path, and what to do."""
     name, context, value = fault["type"], fault.get("ctx") or {}, fault.get("input")
+    header = ".".join(str(part) for part in path if isinstance(part, str))
     if name == "literal_error":
         return _one_of(str(context["expected"]), value)
     if name in _TABLES:
-        header = ".".join(str(part) for part in path if isinstance(part, str))
         return f"a table is needed, as [{header}] with a setting in each line"
     if name in ("tuple_type", "list_type") and isinstance(value, Mapping):
-        header = ".".join(str(part) for part in path if isinstance(part, str))
         return f"there may be several, so that each begins with two brackets: [[{header}]]"
     words = _IN_WORDS.get(name)
     if words is None:
@@ -91,7 +90,7 @@ def meant(kind: type[BaseModel], path: Path) -> str:
     """What to do about a setting at `path` that a file of this kind does not have."""
     name, here = str(path[-1]), {field for model in _models(kind, path[:-1]) for field in model.model_fields}
     wanted = name.lower().replace("-", "_").replace(" ", "_")
-    places = [f"{'.'.join((*place, wanted))}" for place, model in _sections(kind) if wanted in model.model_fields]
+    places = [".".join((*place, wanted)) for place, model in _sections(kind) if wanted in model.model_fields]
     if wanted in here:
         return f"write {wanted}"
     if places:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agent.core.gate import Limit
+from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
 from calib.estimate.quantities import OFFSET, RESPONSE, Kind, Quantity
@@ -23,10 +24,7 @@ from calib.model import PARAMETERS, Array
 # Standard uncertainty with which an unknown is set free, by its unit: beyond what a mistake would hardly reach.
 FREE: Mapping[str, float] = {"rad": 0.2, "1": 0.2, "s": 0.02, "m/s2": 2.0, "Hz": 1.0}
 UNITS: Mapping[str, tuple[str, float]] = {"rad": ("deg", 180.0 / np.pi), "1": ("%", 100.0), "s": ("ms", 1e3)}
-AN_UNKNOWN = 2.0  # chi-squared that an unknown more must gain (Akaike 1974)
 WORTH = 3.0  # an explanation that makes chi-squared smaller by less explains nothing
-AS_WELL = 10.0  # explanations whose chi-squared differs by less cannot be told apart
-
 
 ACCEPT = (
     "put the newest estimate in force: fieldcal command accept --sequence N (if there is none, the windows do not "
@@ -71,12 +69,12 @@ def explained(state: State, held: Sequence[Record], jump: Array, limit: Limit, *
     if not found or before < WORTH * found[0].chi2:
         return f"{said} No known explanation fits them. Compare devices and mount with the configuration"
     # Of those that fit alike, the one with the fewest unknowns: a mount that turned is also a change of all S.
-    best = min((e for e in found if e.score < found[0].score + AS_WELL), key=lambda e: len(e.members))
+    best = min((e for e in found if e.score < found[0].score + DECISIVE), key=lambda e: len(e.members))
     fits = "Best fits" if best.chi2 <= sound else "Nearest, though not within what chance allows, is"
     alike = [
         _told(e, state.scale)
         for e in found
-        if e is not best and e.score < found[0].score + AS_WELL and not best.members < e.members
+        if e is not best and e.score < found[0].score + DECISIVE and not best.members < e.members
     ]
     others = f" As well fits: {'; '.join(alike)}." if alike else ""
     return (

@@ -78,33 +78,25 @@ def forward(root: Array, rows: Sequence[Array], passages: Sequence[Passage]) -> 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothed:
-    """All epochs by all rows: `d` (K, N), `own` (K, N, N) their covariances, `with_last` (K, N, N) those of each epoch
-    (rows) with the last one (columns). `noise_with_last`: (J, N) those of each passage's w with the last epoch."""
+    """All epochs by all rows: `d` (K, N), and their covariances `own` (K, N, N), (0, N, N) if nobody asked for them."""
 
     d: Array
     own: Array
-    with_last: Array
-    noise_with_last: Sequence[Array]
 
 
 def backward(root: Array, links: Sequence[Link], *, covariance: bool = True) -> Smoothed:
     """From the last epoch back to the first."""
-    d, factor = solved(root)
-    joint = factor @ factor.T
-    count, size = len(links) + 1, len(d)
-    out, (own, with_last) = np.zeros((count, size)), (np.zeros((count if covariance else 0, size, size)) for _ in "oc")
-    out[-1], noises = d, [np.zeros((0, size))] * len(links)
-    if covariance:
-        own[-1] = with_last[-1] = joint
+    last, factor = solved(root)
+    count, size = len(links) + 1, len(last)
+    d, own = np.zeros((count, size)), np.zeros((count if covariance else 0, size, size))
+    d[-1], own[-1:] = last, factor @ factor.T
     for k in range(count - 2, -1, -1):
         link, p = links[k], links[k].passage
         inverse = np.linalg.inv(link.own)
         back = p.back @ p.noise
-        out[k] = p.back @ (out[k + 1] - p.gap) - back @ (inverse @ (link.z - link.next @ out[k + 1]))
+        d[k] = p.back @ (d[k + 1] - p.gap) - back @ (inverse @ (link.z - link.next @ d[k + 1]))
         if covariance:
             follows = p.back + back @ inverse @ link.next
             left = back @ inverse
             own[k] = follows @ own[k + 1] @ follows.T + left @ left.T
-            with_last[k] = follows @ with_last[k + 1]
-            noises[k] = -inverse @ link.next @ with_last[k + 1]
-    return Smoothed(out, own, with_last, noises)
+    return Smoothed(d, own)

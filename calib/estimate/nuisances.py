@@ -213,7 +213,6 @@ class Nuisances:
         self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied, reference: str = ""
     ) -> None:
         """`reference` is the identity of the reference; see calib.estimate.terms."""
-        self._made_of = poses, channels, priors, reference
         self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
         n = len(poses)
         self._stated = np.zeros((n, 3, channels))
@@ -253,12 +252,6 @@ class Nuisances:
 
     def __len__(self) -> int:
         return len(self.terms)
-
-    def are_of(self, pose: Pose, channels: int, priors: Priors, reference: str) -> bool:
-        """Whether they were made of this pose alone and of these arguments."""
-        poses, of_channels, of_priors, of_reference = self._made_of
-        same = len(poses) == 1 and poses[0] is pose and of_priors is priors
-        return same and (of_channels, of_reference) == (channels, reference)
 
     def with_applied(self, applied: Applied) -> Nuisances:
         """The same nuisances with other values removed from the data: much sooner made than anew."""

@@ -1,4 +1,4 @@
-"""What a joint state knows of the response over frequency, beside the terms that are among its unknowns."""
+"""What is known of the response over frequency, beside its terms, which are unknowns of the estimate."""
 
 from __future__ import annotations
 
@@ -144,13 +144,6 @@ class OverFrequency:
             state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0,
             known=Known.of(self.stated(priors)),
         )  # fmt: skip
-
-    def steady(self, state: Now, reference: str, priors: Priors) -> dict[str, float]:
-        """Derivatives, by the key of each term, of the logarithm of the sensitivity at 0 Hz over that at the reference
-        frequency."""
-        own, unit = self._unknowns(state, reference)
-        by_unknown = -(_at_reference(self.stated(priors)) * unit)[: len(own)]
-        return {state.keys[k]: float(by) for k, by in zip(own, by_unknown, strict=True)}
 
     def log_h(self, state: Now, reference: str, frequency_hz: float) -> float:
         """ln |h| beside a reference at a frequency, 0 at 0 Hz."""

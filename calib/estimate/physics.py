@@ -105,7 +105,7 @@ class Windows:
             own[: len(record.response)] = record.response
         self.removed = taken @ self.at_hz + known_size
         self.channel = np.resize(np.arange(max(real, 1)), m)  # integrals have the error of their own channel
-        self._real = real
+        self._real, self._first = real, np.eye(1, m)[0]
 
     def _stack(self, name: str) -> Array:
         return np.array([getattr(record, name) for record in self.records])
@@ -122,12 +122,10 @@ class Windows:
         s = p[..., S].reshape(*p.shape[:-1], 3, 3) * stretch[..., None]
         left = p[..., RESPONSE] @ self.at_hz  # of ln |h| at the reference frequency
         at_0hz = s * (1.0 - left)[..., None, None]
-        turn, lag = rotation(p[..., TURN]), p[..., LAG]
-        direction = self._direction(p, turn)
-        ahead = (turn @ p[..., AHEAD][..., None])[..., 0] * self.per_omega[:, None]
-        slopes = self._slopes(p, s, direction, ahead, lag, left)
+        direction, ahead = self._motion(p)
+        slopes = self._slopes(p, s, direction, ahead, left)
         if self.away is None:
-            level = p[..., Q] + self._under_gravity(p, at_0hz, direction, ahead, lag)
+            level = p[..., Q] + self._under_gravity(p, at_0hz, direction, ahead)
         else:  # the input acts the same all the time, so that the mean of V tells no part of it
             level = p[..., Q] + _times(at_0hz.real, self.away)
         over = np.stack([level, p[..., OVER_T][..., :3], p[..., OVER_T][..., 3:]], axis=-2)
@@ -137,40 +135,36 @@ class Windows:
         """(..., W, 3) the part of the mean of V that is not Q, at the temperature of S and Q."""
         s = p[..., S].reshape(*p.shape[:-1], 3, 3) * np.exp(-self.removed)[:, None, None]
         at_0hz = s * (1.0 - p[..., RESPONSE] @ self.at_hz)[..., None, None]
-        turn = rotation(p[..., TURN])
-        ahead = (turn @ p[..., AHEAD][..., None])[..., 0] * self.per_omega[:, None]
-        return self._under_gravity(p, at_0hz, self._direction(p, turn), ahead, p[..., LAG])
+        return self._under_gravity(p, at_0hz, *self._motion(p))
 
-    def _under_gravity(self, p: Array, s: Array, direction: Array, ahead: Array, lag: Array) -> Array:
+    def _under_gravity(self, p: Array, s: Array, direction: Array, ahead: Array) -> Array:
         gravity = (rotation(p[..., TURN_GRAVITY]) @ self.gravity[..., None])[..., 0]
         output = _times(s, gravity * (1.0 + p[..., GRAVITY] / self.magnitude[:, None]))
         if self.channels:
             mean, rate = np.split(self.mean_x, 2, axis=1)
             output = output + _times(s, _times(direction, mean) + ahead * rate[:, :1])
-            output = output - lag * _times(s, _times(direction, rate))
+            output = output - p[..., LAG] * _times(s, _times(direction, rate))
         return output
 
-    def _direction(self, p: Array, turn: Array) -> Array:
-        """D (..., W, 3, M), for means and motion that each channel has by itself."""
+    def _motion(self, p: Array) -> tuple[Array, Array]:
+        """D (..., W, 3, M), for means and motion that each channel has by itself, and R q / omega (..., W, 3)."""
+        turn = rotation(p[..., TURN])
+        ahead = _times(turn, p[..., AHEAD]) * self.per_omega[:, None]
         if not self.channels:
-            return np.zeros((*p.shape[:-1], 3, 0))
-        first = np.zeros(self.channels)
-        first[0] = 1.0
-        sideways = self.direction + p[..., ACROSS][..., None] * first
+            return np.zeros((*p.shape[:-1], 3, 0)), ahead
+        sideways = self.direction + p[..., ACROSS][..., None] * self._first
         felt = turn @ sideways[..., : self._real]
         felt = np.concatenate([felt, p[..., CORNER][..., None] * felt], axis=-1)[..., : self.channels]
-        return felt / (1.0 + p[..., REFERENCE][..., self.channel])[..., None, :]
+        return felt / (1.0 + p[..., REFERENCE][..., self.channel])[..., None, :], ahead
 
-    def _slopes(self, p: Array, s: Array, direction: Array, ahead: Array, lag: Array, left: Array) -> Array:
+    def _slopes(self, p: Array, s: Array, direction: Array, ahead: Array, left: Array) -> Array:
         if not self.channels:
             return np.zeros((*p.shape[:-1], 0, 3))
-        s = s @ self.excited + self.silent
+        s, lag = s @ self.excited + self.silent, p[..., LAG]
         ideal = s @ (direction @ self.along)
         on_u = ideal * (1.0 - 0.5 * lag**2 * self.omega2[:, None])[..., None]
         on_rate = s @ (direction @ self.along_rate) - ideal * lag[..., None]
-        first = np.zeros(self.channels)
-        first[0] = 1.0
-        on_rate = on_rate + _times(s, ahead)[..., None] * first
+        on_rate = on_rate + _times(s, ahead)[..., None] * self._first
         slopes = self.root @ np.concatenate([on_u - left[..., None, None] * ideal, on_rate], axis=-1).mT
         if self.passed.any():
             flat = self.passed.reshape(len(self.passed), TERMS, -1)

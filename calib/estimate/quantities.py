@@ -104,11 +104,6 @@ class Kind:
     since_certificate: bool = False
 
     @property
-    def of_nuisance(self) -> bool:
-        """Whether its prior is one of calib.estimate.nuisances.Priors."""
-        return self.prior is not None and self.prior.name in PRIORS
-
-    @property
     def statements(self) -> list[Statement]:
         """The statements on its value before any data: standard uncertainty and mean."""
         return [s for s in (self.prior, self.mean) if s is not None]

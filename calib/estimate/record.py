@@ -106,9 +106,8 @@ class Record:
         channels, type_a = data.channels, data.type_a
         live = np.repeat(np.diag(data.root[0]) > 0.0, 3)
         freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
-        own = min(
-            freedom / FEWEST_FREEDOM, 1.0
-        )  # where segments are few, the rest is what a filter makes of white noise
+        # Where segments are few, the rest is what a filter makes of white noise.
+        own = min(freedom / FEWEST_FREEDOM, 1.0)
         ratio = np.array([type_a.slope_ratio(live) if live.any() else 1.0, np.diag(type_a.means).mean()])
         passed, told = np.zeros((TERMS, 2 * channels, channels)), np.zeros((0, TERMS + 1))
         deviations, left_open = Deviations(), LeftOpen()

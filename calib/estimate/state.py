@@ -21,7 +21,7 @@ from calib.estimate.innovation import Innovation
 from calib.estimate.never_turned import never_turned
 from calib.estimate.nuisances import Priors
 from calib.estimate.over_frequency import OverFrequency, changed
-from calib.estimate.quantities import ALL_RATES, KINDS, LAG, PRIORS, REFERENCE_DRIFT, S_AND_Q, Quantity
+from calib.estimate.quantities import ALL_RATES, KINDS, LAG, PRIORS, S_AND_Q, Quantity
 from calib.estimate.record import Record
 from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
@@ -89,7 +89,7 @@ class State:
         self._dated: list[Dated] = []
         self._over = OverFrequency()
         self._held_mps2: Array | None = None  # mean input acceleration of a mount that never turned so far
-        self._now = self._solution().now
+        self._now = estimate([], self.statements).now
         self._read: tuple[Now, str, Array, Array] | None = None  # what `_values` found
         self._stated_then: Any = None  # what was stated when a loaded state was kept, if that is another now
         self._newest_day: int | None = None  # of the data; None before any window
@@ -112,14 +112,11 @@ class State:
             tuple(self._dated), self._held_mps2 if self._fixed else None,
         )  # fmt: skip
 
-    def estimate(self) -> Estimate:
-        """The whole solution: the past and the budget as well."""
-        return self._solution()
-
-    def _solution(self, noise: Noise | None = None) -> Estimate:
+    def estimate(self, noise: Noise | None = None) -> Estimate:
+        """The whole solved anew, the past as well; `noise`: None pools that of the records."""
         also = [max(r.day for r in self._records)] if self._records else []
         also += [step.day for step in self._steps if also and step.day > also[0]]
-        start = getattr(self, "_now", None) if self._records else None
+        start = self._now if self._records else None
         return estimate(self._records, self.statements, start=start, also=also, noise=noise)
 
     @property
@@ -203,11 +200,6 @@ class State:
     def motion_to_hz(self) -> float:
         """Upper end of the motion that is used; inf before a window told a band that is wide enough for a response."""
         return self._over.to_hz
-
-    @property
-    def determined(self) -> Flags:
-        """(12,) see calib.estimate.determined."""
-        return self._determined(*self._parameters())
 
     def _determined(self, mean: Array, covariance: Array) -> Flags:
         return determined(mean, np.sqrt(covariance.diagonal()), self._u, np.ones(12, dtype=bool))
@@ -301,12 +293,6 @@ class State:
         return [quantity.name for quantity in self.present]
 
     @property
-    def drifts(self) -> list[tuple[str, float]]:
-        """(key, value) of the drift of each channel of the present reference, relative."""
-        own = [q for q in self.present if q.kind is REFERENCE_DRIFT]
-        return [(q.key, self.quantity(q.key)[0]) for q in own]
-
-    @property
     def references(self) -> list[str]:
         """References to whose errors S and Q owe their values; the newest window's is the last."""
         return list(self._used)
@@ -334,7 +320,7 @@ class State:
 
     def chi2_beside(self, records: Sequence[Record]) -> float:
         """That of this state alone with the noise of these records pooled in: what `after` is compared with."""
-        return self._solution(Noise.of([*self._records, *records])).chi2
+        return self.estimate(Noise.of([*self._records, *records])).chi2
 
     def changes(
         self,
@@ -399,7 +385,7 @@ class State:
 
     def solve(self) -> None:
         """Everything anew, from the records and the statements."""
-        self._now = self._solution().now
+        self._now = self.estimate().now
 
     def beyond(self, base: State) -> tuple[list[Record], list[Step]]:
         """The windows and the steps that an earlier state does not have, of which this one is a copy that went on."""

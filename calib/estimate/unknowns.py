@@ -64,6 +64,12 @@ class Unknowns:
     """All unknowns of some records under some statements: N of them, S and Q (12) first."""
 
     def __init__(self, statements: Statements, records: Sequence[Record]) -> None:
+        self._begin(statements, records)
+        self._add(self._of_sensor())
+        for record in records:
+            self.meet(record)
+
+    def _begin(self, statements: Statements, records: Sequence[Record]) -> None:
         self.statements = statements
         self.begin = min((*(r.days[0] for r in records), *(d.day for d in statements.dated)), default=0.0)
         self.all: list[Unknown] = []
@@ -71,9 +77,6 @@ class Unknowns:
         self._terms: dict[tuple[object, ...], list[Term]] = {}
         self._effects: dict[tuple[object, ...], Array] = {}
         self._taken_out: dict[tuple[object, ...], Array] = {}
-        self._add(self._of_sensor())
-        for record in records:
-            self.meet(record)
 
     def __len__(self) -> int:
         return len(self.all)
@@ -84,7 +87,7 @@ class Unknowns:
 
     def meet(self, record: Record) -> list[Unknown]:
         """The unknowns of a record that were not there before, which come in with their priors."""
-        if record.setting in self._terms:
+        if record.setting in self:
             return []
         self._terms[record.setting] = self._terms_of(record)
         self._effects.clear()
@@ -107,9 +110,7 @@ class Unknowns:
     def loaded(cls, statements: Statements, records: Sequence[Record], all_: Iterable[Unknown]) -> Unknowns:
         """Those of a snapshot, in their order. What is an unknown only by the statements of now is none."""
         found = object.__new__(cls)
-        found.statements = statements
-        found.begin = min((*(r.days[0] for r in records), *(d.day for d in statements.dated)), default=0.0)
-        found.all, found.at, found._terms, found._effects, found._taken_out = [], {}, {}, {}, {}
+        found._begin(statements, records)
         found._add(all_)
         for record in records:
             if record.setting not in found:
@@ -171,6 +172,11 @@ class Unknowns:
             return
         bound = 4.0 * u**2  # later the mount may lean by more than its prior says of the day of mounting
         yield Unknown(t.quantity, t.expected, u, since, float(walk**2), bound if walk else np.inf)
+
+    @property
+    def a_day(self) -> Array:
+        """(12,) variance a day of the random walks of S and Q."""
+        return np.array([unknown.a_day for unknown in self.all[:12]])
 
     @property
     def prior(self) -> tuple[Array, Array]:

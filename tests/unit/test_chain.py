@@ -51,10 +51,6 @@ def test_the_last_epoch_and_all_earlier_ones_are_those_of_the_whole_problem(seed
     for k, (at, shift) in enumerate(zip(drawn.maps, drawn.shifts, strict=True)):
         np.testing.assert_allclose(back.d[k], at @ drawn.solution + shift, rtol=0, atol=1e-8)
         np.testing.assert_allclose(back.own[k], at @ drawn.covariance @ at.T, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(back.with_last[k], at @ drawn.covariance @ last.T, rtol=0, atol=1e-8)
-    for k, found in enumerate(back.noise_with_last):
-        own = slice(N + k * CHANGES, N + (k + 1) * CHANGES)
-        np.testing.assert_allclose(found, drawn.covariance[own] @ last.T, rtol=0, atol=1e-8)
 
 
 def test_epoch_by_epoch_it_is_the_same_as_at_once() -> None:

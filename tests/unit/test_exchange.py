@@ -24,9 +24,9 @@ def fresh(stated: dict[str, float], temperature: TemperatureModel | None = None,
     return State(mean, U, priors, Wander(STEADY), temperature or TemperatureModel(), fixed=False)
 
 
-def lived(windows: int = 6, error: float = 0.0, **recursion: object) -> State:
-    """A recursion after windows of an hour each, the temperature between 15 and 25 deg C."""
-    random, found = np.random.default_rng(1), fresh(STATED, **recursion)  # type: ignore[arg-type]
+def lived(windows: int = 6, error: float = 0.0, **begun: object) -> State:
+    """A state after windows of an hour each, the temperature between 15 and 25 deg C."""
+    random, found = np.random.default_rng(1), fresh(STATED, **begun)  # type: ignore[arg-type]
     found.meet("A")
     for k in range(windows):
         window = building_window(random, level_mps2=(0.1, 0.1, 0.1), reference_error=error)

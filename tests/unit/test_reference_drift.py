@@ -26,7 +26,7 @@ EXACT = {"level_mps2": (0.0, 0.5, 0.0), "noise_mps2": 0.001}
 SYY = 4
 
 
-def recursion(stability: float = STABILITY, walk: float = WALK) -> State:
+def drifting(stability: float = STABILITY, walk: float = WALK) -> State:
     priors = Priors(reference=CONSTANT, reference_drift=stability, offset_mps2=1e-3, rotation_rad=0.0)
     wander = replace(
         Wander.none(),
@@ -50,7 +50,7 @@ def by_hand(days: list[float], stability: float, walk: float) -> float:
 
 @pytest.mark.parametrize("since_days", [0.0, 91.3, 4 * YEAR_DAYS])
 def test_what_a_first_window_tells_of_s_is_as_uncertain_as_the_time_since_the_certificate(since_days: float) -> None:
-    found = recursion()
+    found = drifting()
     found.date_certificate(10.0 - since_days)
     found.update(Record.of(building_window(np.random.default_rng(1), **EXACT), 10.0))
     expected = np.hypot(CONSTANT, STABILITY * np.sqrt(since_days / YEAR_DAYS))
@@ -62,7 +62,7 @@ def test_years_of_windows_divide_a_change_between_sensor_and_reference_as_both_a
     stability: float, walk: float
 ) -> None:
     random, days = np.random.default_rng(2), [YEAR_DAYS + 73.0 * k for k in range(16)]
-    found = recursion(stability, walk)
+    found = drifting(stability, walk)
     found.date_certificate(0.0)
     for day in days:
         found.update(Record.of(building_window(random, **EXACT), day))
@@ -70,7 +70,7 @@ def test_years_of_windows_divide_a_change_between_sensor_and_reference_as_both_a
 
 
 def test_without_a_window_u_grows_by_the_walk_of_the_sensor() -> None:
-    found = recursion()
+    found = drifting()
     found.date_certificate(0.0)
     found.update(Record.of(building_window(np.random.default_rng(3), **EXACT), 100.0))
     u, later = (found.law(day).covariance[SYY, SYY] for day in (100.0, 100.0 + YEAR_DAYS))
@@ -78,7 +78,7 @@ def test_without_a_window_u_grows_by_the_walk_of_the_sensor() -> None:
 
 
 def test_another_reference_drifts_from_its_own_certificate_on() -> None:
-    found, random = recursion(), np.random.default_rng(4)
+    found, random = drifting(), np.random.default_rng(4)
     found.meet("A")
     found.date_certificate(0.0)
     found.update(Record.of(building_window(random, **EXACT), 10.0, reference="A"))
@@ -106,9 +106,9 @@ def test_the_agent_counts_from_the_date_in_the_configuration_to_the_utc_of_the_f
 
 
 def test_a_snapshot_keeps_the_date() -> None:
-    found = recursion()
+    found = drifting()
     found.date_certificate(3.0)
-    again = recursion()
+    again = drifting()
     again.load(found.snapshot())
     one = Record.of(building_window(np.random.default_rng(5), **EXACT), 500.0)
     found.update(one)

@@ -47,7 +47,7 @@ def parameters(found: State) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("step", "u"), [(0.02, U_REFERENCE), (-0.004, 1e-3), (0.0, 0.01), (0.01, 1e-9)])
-def test_a_corrected_recursion_is_that_of_the_same_data_with_the_other_certificate(step: float, u: float) -> None:
+def test_a_corrected_state_is_that_of_the_same_data_with_the_other_certificate(step: float, u: float) -> None:
     found = child(np.random.default_rng(1), 0.0, windows=3, drift=2e-3)
     expected = child(np.random.default_rng(1), 1.0 / (1.0 + step) - 1.0, u=u, windows=3, drift=2e-3)
     (share,) = found.shares

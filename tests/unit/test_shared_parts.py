@@ -23,16 +23,6 @@ def test_nuisances_with_other_values_removed_are_those_made_anew() -> None:
     assert [t.applied for t in first.terms].count(0.001) == 1
 
 
-def test_nuisances_are_shared_by_windows_of_one_pose_alone() -> None:
-    pose, other = (beside(np.eye(3), [0.0, 0.0, 9.8]) for _ in range(2))
-    priors = Priors()
-    made = Nuisances([pose], 3, priors, Applied(), "A")
-    assert made.are_of(pose, 3, priors, "A")
-    assert not made.are_of(other, 3, priors, "A")
-    assert not made.are_of(pose, 3, priors, "B")
-    assert not made.are_of(pose, 3, Priors(lag_s=0.01), "A")
-
-
 @pytest.mark.parametrize("n", [1, 2, 3, 16, 17, FEW, FEW + 1, FEW + 2, 1001])
 def test_order_statistics_are_those_of_numpy(n: int) -> None:
     values = np.random.default_rng(n).normal(size=(3, 2, n))

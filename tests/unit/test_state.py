@@ -1,4 +1,4 @@
-"""The recursion against other ways to the same numbers, and what it must never do however long it runs."""
+"""The state against other ways to the same numbers, and what it must never do however long it runs."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_what_was_not_excited_stays_to_the_last_digit() -> None:
     S = found.result().sensitivity.ravel()
     np.testing.assert_allclose(S[OTHERS], MEAN[OTHERS], rtol=0, atol=1e-12)
     np.testing.assert_allclose(S[COLUMN_Y], S_TRUE.ravel()[COLUMN_Y], rtol=0, atol=3e-3)
-    np.testing.assert_array_equal(np.flatnonzero(found.determined[:9]), COLUMN_Y)
+    np.testing.assert_array_equal(np.flatnonzero(found.result().determined[:9]), COLUMN_Y)
     np.testing.assert_allclose(found.result().standard_uncertainty[OTHERS], U[OTHERS], rtol=1e-9)
 
 
