@@ -22,6 +22,8 @@ def print_outcome(outcome: Outcome, *, everything: bool = False) -> None:
         _print_nuisances(outcome.nuisances, outcome.coverage_factor)
         say(f"  sampling rate {outcome.rate_hz:.7g} Hz")
     say(f"  method {outcome.method}, {sum(w.used for w in outcome.windows)} windows")
+    if outcome.more.get("joint"):
+        say("  the JSON result keeps what is known of sums of elements of S: state it next as --prior")
     print_warnings(outcome.warnings)
     for line in lines_of(outcome):
         say(f"  {with_dashes(line)}")

@@ -40,7 +40,7 @@ def options_of(params: Mapping[str, Any]) -> Options:
 def read_prior(path: Path) -> tuple[Array, Array]:
     """Values and covariance from an earlier result or certificate, as `prior_of` gives them. Raises TableError."""
     try:
-        return prior_of(*read_earlier(path))
+        return prior_of(*read_earlier(path, joint=True))
     except OptionError as error:
         raise TableError(f"{path}: {error.problem}; {error.remedy}") from None
     except EarlierError as error:

@@ -28,11 +28,14 @@ class EarlierError(Exception):
     """The file does not say S and Q. The message names the file, the reason and the remedy."""
 
 
-def read_earlier(path: Path) -> tuple[Array, Array]:
-    """S row by row and Q (12,), and their covariance (12, 12); NaN where nothing is known. Raises EarlierError."""
+def read_earlier(path: Path, *, joint: bool = False) -> tuple[Array, Array]:
+    """S row by row and Q (12,), and their covariance (12, 12); NaN where nothing is known. Raises EarlierError.
+
+    `joint`: with what a result knows of combinations of elements of S, of which single ones are not known.
+    """
     try:
         data = read_file(path, LARGEST)
-        return _from_xml(data) if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") else _from_json(data)
+        return _from_xml(data) if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") else _from_json(data, joint)
     except OSError as error:
         raise EarlierError(f"{path}: {error.strerror}") from None
     except _OtherXmlError as error:
@@ -69,10 +72,12 @@ class _OtherXmlError(Exception):
     """XML without S and Q as this program writes them."""
 
 
-def _from_json(data: bytes) -> tuple[Array, Array]:
+def _from_json(data: bytes, joint: bool) -> tuple[Array, Array]:
     told: dict[str, Any] = json.loads(data)
     if "certificate" in told:
         told = told["certificate"]["result"]
+    if joint:
+        told = told.get("joint") or told
     S, Q, covariance = (np.array(told[name], dtype=float) for name in ("sensitivity", "offset", "covariance"))
     if (S.shape, Q.shape, covariance.shape) != ((3, 3), (3,), (12, 12)):
         raise ValueError("sensitivity must have 3 x 3 numbers, offset 3 and covariance 12 x 12")

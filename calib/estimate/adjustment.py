@@ -25,13 +25,16 @@ from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare, share_after
 from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
 from calib.estimate.slope_scatter import SlopeScatter, estimated
-from calib.estimate.verdict import misfit, nuisance_pull, reasons, turned_windows
+from calib.estimate.verdict import misfit, nothing_determined, nuisance_pull, reasons, turned_windows
 from calib.excitation.bands import motion_band_hz
-from calib.excitation.excited import excited
+from calib.excitation.excited import excited_together
 from calib.model import Array, Calibration, Pose, Window
 
 SCATTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
 SCATTER_SETTLED = 0.05
+# Standard uncertainty, over the sensor's scale, of S along a direction that nothing excited, where it becomes a prior.
+# An element of which more than UNSEEN_SHARE (calib.estimate.equations) lies along it may then be off by that scale.
+UNKNOWN = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +61,7 @@ class Grounds:
     priors: Priors
     applied: Applied
     scatter: SlopeScatter
+    ways: Array
 
     @cached_property
     def reasons(self) -> tuple[str, ...]:
@@ -65,8 +69,8 @@ class Grounds:
         return tuple(reasons(self.windows, self.solution, self.shares, self.determined, self._turned))
 
     def _turned(self, static: int, factor: float) -> Solution:
-        turned = [excited(w).pose for w in turned_windows(self.windows, static, factor)]
-        return _solution(turned, self.data, self.priors, self.applied, self.scatter)
+        turned, _ = excited_together(turned_windows(self.windows, static, factor))
+        return _solution([e.pose for e in turned], self.data, self.priors, self.applied, self.scatter, self.ways)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,6 +116,28 @@ class Adjustment:
         return self.coverage_factor * self.calibration.standard_uncertainty
 
     @property
+    def joint(self) -> tuple[Array, Array] | None:
+        """S and Q (12,) and their covariance (12, 12) with all that is known of combinations of elements of S, for the
+        next adjustment's `Priors`: of a motion in a plane, S times the directions in it. NaN for Q where nothing is
+        known of it.
+
+        None where `calibration` says as much, and where the data are refused for another reason than that they
+        determine nothing.
+        """
+        solution = self.grounds.solution
+        hopeless = tuple(nothing_determined(solution, self.grounds.determined))
+        if np.isfinite(self.calibration.sensitivity).all() or self.reasons not in ((), hopeless):
+            return None
+        values, covariance = self.mean[:12].copy(), self.covariance[:12, :12].copy()
+        equations = solution.equations
+        if not solution.bounded[:9].all():
+            unexcited = UNKNOWN * equations.output_per_mps2 * equations.unexcited
+            covariance[:9, :9] += np.kron(np.eye(3), unexcited.T @ unexcited)
+        unknown = np.append(np.zeros(9, dtype=bool), ~np.isfinite(self.calibration.offset))
+        values[unknown], covariance[unknown, :], covariance[:, unknown] = np.nan, np.nan, np.nan
+        return values, covariance
+
+    @property
     def lag_s(self) -> float | None:
         """By how much the sensor's indications come after the reference's; None where the lag is no unknown."""
         return next((n.value for n in self.nuisances if n.kind is LAG), None)
@@ -134,7 +160,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     stated = priors
     if never_turned(np.array([mean_input(w) for w in used])):
         priors = _without_offset(priors)
-    found = [excited(w) for w in used]
+    found, ways = excited_together(used)
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
     one_frequency = priors.response_terms == 1.0
     to_hz = np.inf if one_frequency else priors.response_hz
@@ -144,17 +170,19 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     held = [e.pose for e in found]
-    solution = _solution(held, data, priors, applied, scatter)
+    solution = _solution(held, data, priors, applied, scatter, ways)
     for _ in range(SCATTER_TURNS if priors.lag_s > 0.0 else 0):
         larger = estimated(scatter, *slope_residuals(solution), data.type_a.slopes)
         if larger.lag_s.max() <= (1.0 + SCATTER_SETTLED) * scatter.lag_s.max():
             break
         scatter = larger
-        solution = _solution(held, data, priors, applied, scatter)
+        solution = _solution(held, data, priors, applied, scatter, ways)
     shares = budget(solution, priors.offset_mps2, priors.known_u)
     mean, covariance = solution.x[:12], shares.covariance[:12, :12]
-    told = determined(mean, np.sqrt(np.diag(covariance)), _prior_u(stated), solution.equations.seen)
-    known = told | np.isfinite(_prior_u(stated))
+    prior_u = _prior_u(stated, solution.equations.output_per_mps2)
+    seen = solution.equations.seen | solution.bounded  # what the data do not see, they may tell by combinations
+    told = determined(mean, np.sqrt(np.diag(covariance)), prior_u, seen)
+    known = told | np.isfinite(prior_u)
     values = np.where(known, mean, np.nan)
     k = coverage_factor(float(np.min(shares.degrees_of_freedom[told], initial=np.inf)))
     return Adjustment(
@@ -169,7 +197,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         nuisances=_reported(solution, shares),
         contributions=shares.contributions,
         coverage_factor=k,
-        grounds=Grounds(used, solution, shares, told, data, priors, applied, scatter),
+        grounds=Grounds(used, solution, shares, told, data, priors, applied, scatter, ways),
         rank=solution.equations.rank,
         chi2=shares.consistency[0],
         chi2_degrees_of_freedom=shares.consistency[1],
@@ -211,9 +239,9 @@ def _response(
 
 
 def _solution(
-    held: Sequence[Pose], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter
+    held: Sequence[Pose], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter, ways: Array
 ) -> Solution:
-    """`held`: the pose of each window."""
+    """`held`: the pose of each window; `ways` (3, k): the directions that the windows excite."""
     poses: list[Pose] = []
     index: dict[tuple[str, bytes], int] = {}
     pose_of = []
@@ -226,14 +254,17 @@ def _solution(
         pose_of.append(index[key])
     nuisances = Nuisances(poses, data.channels, priors, applied)
     scale = priors.output_per_mps2
-    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, scatter, scale), priors)
+    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, scatter, scale, ways), priors)
 
 
-def _prior_u(priors: Priors) -> Array:
-    """(12,) standard uncertainties of S and Q before any data, inf where nothing was known."""
+def _prior_u(priors: Priors, scale: float) -> Array:
+    """(12,) standard uncertainties of S and Q before any data, inf where nothing was known: of an element of S, also
+    where only combinations with others were known, so that it may be off by the sensor's scale."""
     if priors.parameters is None or priors.covariance is None:
         return np.full(12, np.inf)
-    return np.asarray(np.where(np.isfinite(priors.parameters), np.sqrt(np.diag(priors.covariance)), np.inf))
+    u = np.where(np.isfinite(priors.parameters), np.sqrt(np.diag(priors.covariance)), np.inf)
+    u[:9] = np.where(u[:9] < scale, u[:9], np.inf)
+    return np.asarray(u)
 
 
 def _without_offset(priors: Priors) -> Priors:

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.estimate.banded import Banded, banded
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Index, Segments, TypeA, in_order, pooled
-from calib.excitation.excited import OF_STRONGEST
+from calib.excitation.excited import NOISE_LEFT, OF_STRONGEST, OVER_NOISE
 from calib.model import Array, BandSums, WindowSums, own_channels
 from calib.signal.response import POWERS
 
@@ -24,6 +24,8 @@ PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the chann
 # reference would be taken for a motion that the sensor does not follow. Half the limit of calib.excitation.excited: a
 # channel that it found to be excited stays so after the noise was subtracted, which is a tenth of its power at most.
 EXCITED = 0.5 * OF_STRONGEST
+# Of the power of a channel's derivative, what other channels leave of it: with less it is mostly another channel.
+SHARED = 0.5
 
 
 class Summed(Protocol):
@@ -80,7 +82,7 @@ def condense(
     parts = _segments(windows, sums, channels)
     del sums  # of a day, as much memory as the parts
     powers_of = [part.xx.sum(1) for part in parts]
-    roots, whiteners = zip(*map(_roots, powers_of), strict=True)
+    roots, whiteners = zip(*map(_roots, powers_of, map(_left, parts)), strict=True)
     omega2, of_each = (in_order(parts, own) for own in zip(*(_omega2(p, channels) for p in powers_of), strict=True))
     told = None
     if response_hz:
@@ -106,7 +108,12 @@ def mean_frequency_hz(data: Condensed) -> float:
     if data.bands is None or not power.any():
         return 0.0
     square = -data.bands.projected[:, 0, real, real]  # by c_2, the slopes on u move by -omega^2
-    return float(np.sqrt(max(np.sum(power * square), 0.0) / power.sum())) / (2.0 * np.pi)  # below 0 it only drifts
+    # Of a tone on an ellipse, the derivative of one channel is another channel, and tells little beside it.
+    rates = [data.channels + k for k in real]
+    alone, whole = data.root[:, rates, rates] ** 2, np.sum(data.root[:, :, rates] ** 2, axis=1)
+    shared = (power == 0.0).any(axis=1) & (alone < SHARED * whole).any(axis=1)
+    square[shared] = data.omega2[shared, None]
+    return float(np.sqrt(max(np.sum(power * square), 0.0) / power.sum())) / (2.0 * np.pi)
 
 
 def effective(data: Condensed, independent: Array) -> Condensed:
@@ -172,15 +179,24 @@ def _alike(at: Index, windows: Sequence[Summed], sums: Sequence[WindowSums], cha
     )
 
 
-def _roots(power: Array) -> tuple[Array, Array]:
+def _left(part: Segments) -> Array:
+    """(W, 2M) the power of the reference's noise that may be left in the sums of a motion in a plane after it was
+    subtracted. Of a tone on an ellipse the derivative of one channel is another channel: beside it, noise alone is
+    left. Zeros for a motion in all directions, and for channels that show hardly more than noise by themselves."""
+    own, noise = np.diagonal(part.xx.sum(1), axis1=1, axis2=2), part.count.sum(1)[:, None] * part.noise
+    told = (own == 0.0).any(axis=1)[:, None] & (own > OVER_NOISE * noise)
+    return np.where(told, NOISE_LEFT * noise, 0.0)
+
+
+def _roots(power: Array, left: Array) -> tuple[Array, Array]:
     """R (W, 2M, 2M), upper triangular with R'R = power, and T with T power = R.
 
-    A channel without power of its own has rows of zeros.
+    A channel without power of its own has rows of zeros: so much as noise may have `left` (W, 2M) is none.
     """
     size = power.shape[-1]
     own, half = np.diagonal(power, axis1=1, axis2=2), size // 2
     strongest = np.repeat(own.reshape(len(own), 2, half).max(axis=2, initial=0.0), half, axis=1)
-    limit = np.maximum(PIVOT_FLOOR * own, EXCITED * strongest)
+    limit = np.maximum(np.maximum(PIVOT_FLOOR * own, EXCITED * strongest), left)
     moved = own > limit  # noise in a silent channel must not correlate its column of S with the others
     power = np.where(moved[:, :, None] & moved[:, None], power, 0.0)
     work = np.concatenate([power, np.broadcast_to(np.eye(size), power.shape)], axis=2)

@@ -196,7 +196,8 @@ def _lost(thirds: tuple[Third, ...], at_hz: float) -> float:
     shown, unshown, variance = sums.transpose(1, 2, 0)  # each (3, bands)
     share = unshown / np.maximum(shown, TINY)
     u_each = np.sqrt(variance) / np.maximum(shown, TINY)
-    u = MEDIAN_U * np.sqrt(np.mean(u_each**2, axis=1) / u_each.shape[1])
+    with np.errstate(over="ignore"):  # infinite for an axis that shows nothing at all in a band
+        u = MEDIAN_U * np.sqrt(np.mean(u_each**2, axis=1) / u_each.shape[1])
     middle, total = median(share), shown.sum(axis=1)
     counted = (middle > SURELY * u) & (total > LEAST_SHOWN * total.max())
     return float(np.max(middle[counted], initial=0.0))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from calib.estimate.banded import Banded
 from calib.estimate.condense import Condensed
+from calib.estimate.never_turned import never_turned
 from calib.estimate.nuisances import Inputs, Nuisances
 from calib.estimate.slope_scatter import SlopeScatter
 from calib.model import Array
@@ -70,12 +71,17 @@ class Equations:
         offset_scatter_mps2: float,
         scatter: SlopeScatter,
         output_per_mps2: float | None = None,
+        ways: Array | None = None,
     ) -> None:
         """`pose_of` (W,) is the number of each window's pose in `nuisances`. `offset_scatter_mps2` is the SD of the
         offset between windows, `scatter` that of the slopes. `output_per_mps2` is the sensor's scale in output unit per
-        m/s2; None takes it from the data."""
+        m/s2; None takes it from the data. `ways` (3, k), orthonormal: the directions that the windows excite; None:
+        all. A nuisance turns the motion out of them, but what the slopes then show of S in other directions is of
+        second order, and mostly noise: the slopes tell nothing of it.
+        """
         self.data, self.nuisances, self.scatter = data, nuisances, scatter
         self.pose_of_window = np.array(pose_of)
+        self._excited = None if ways is None or ways.shape[1] == len(ways) else ways @ ways.T
         self.known = known = nuisances.known[self.pose_of_window]
         self.output_per_mps2 = self._output_per_mps2() if output_per_mps2 is None else output_per_mps2
         noise2 = data.type_a.noise**2 / data.count[:, None]
@@ -90,12 +96,17 @@ class Equations:
         4 - k."""
         data, nuisances, m = self.data, self.nuisances, self.data.channels
         moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_window])
+        if self._excited is not None:
+            moved = moved @ self._excited
         held = np.einsum("wkm,wm->wk", nuisances.mean_direction[self.pose_of_window], data.mean_x[:, :m])
-        held = np.pad(held + nuisances.gravity[self.pose_of_window], ((0, 0), (0, 1)), constant_values=1.0)
-        rows = np.vstack(
-            [np.pad(moved.reshape(-1, 3), ((0, 0), (0, 1))), (np.sqrt(data.count)[:, None] * held)[self.known]]
-        )
+        held, count = (held + nuisances.gravity[self.pose_of_window])[self.known], data.count[self.known]
+        if self._excited is not None and never_turned(held):  # what an AC-coupled reference shows in the mean is noise
+            held, count = count[None] @ held / count.sum(), count.sum(keepdims=True)
+        held = np.sqrt(count)[:, None] * np.pad(held, ((0, 0), (0, 1)), constant_values=1.0)
+        rows = np.vstack([np.pad(moved.reshape(-1, 3), ((0, 0), (0, 1))), held])
         scale = np.linalg.norm(rows, axis=0)
+        if self._excited is not None:  # the directions are not those of the axes
+            scale[:3] = scale[:3].max()
         scale[scale == 0.0] = 1.0
         _, singular, ways = np.linalg.svd(np.vstack([rows / scale, np.zeros((4, 4))]), full_matrices=False)
         return np.asarray(ways[singular <= RANK_TOLERANCE * singular[0]] / scale)
@@ -111,6 +122,30 @@ class Equations:
         parts = np.abs(self.unseen) / np.linalg.norm(self.unseen, axis=1, keepdims=True)
         free = parts.max(axis=0, initial=0.0) > UNSEEN_SHARE
         return ~np.concatenate([np.tile(free[:3], 3), np.repeat(free[3], 3)])
+
+    @property
+    def unexcited(self) -> Array:
+        """(k, 3) directions in the sensor's frame, orthonormal, along which the data tell nothing of S."""
+        _, size, ways = np.linalg.svd(np.vstack([self.unseen[:, :3], np.zeros((3, 3))]), full_matrices=False)
+        ways = ways[size > UNSEEN_SHARE * max(size[0], np.finfo(float).tiny)]
+        largest = np.take_along_axis(ways, np.argmax(np.abs(ways), axis=1)[:, None], axis=1)
+        return np.asarray(ways * np.sign(largest))
+
+    @property
+    def likely(self) -> Array:
+        """S (3, 3) along directions that are not excited, as a sensor has it whose axes are at right angles, alike and
+        near the stated ones; zeros where all are excited. Only if S is not zero there, an angle that is uncertain shows
+        in u of the rest."""
+        data, m = self.data, self.data.channels
+        if self._excited is None:
+            return np.zeros((3, 3))
+        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_window])
+        told, *_ = np.linalg.lstsq(
+            (moved @ self._excited).reshape(-1, 3), data.slopes[:, :m].reshape(-1, 3), rcond=RANK_TOLERANCE
+        )
+        silent = np.eye(3) - self._excited
+        outputs, _, ways = np.linalg.svd(told.T @ self._excited / self.output_per_mps2 + silent)
+        return np.asarray(self.output_per_mps2 * outputs @ ways @ silent)
 
     def _output_per_mps2(self) -> float:
         """The sensor's scale in output unit per m/s2: rms of the outputs over rms of the inputs, slopes and means."""
@@ -187,6 +222,8 @@ class Equations:
             per_row += np.einsum("bkm,brm->bkr", D, passed)[:, None]
         per_row[:, :, :, D.shape[2] :] += ahead[:, None]
         per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
+        if self._excited is not None:
+            per_row = self._excited @ per_row
         for i in range(3):
             jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])
         jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)

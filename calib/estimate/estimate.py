@@ -22,9 +22,9 @@ import numpy as np
 from calib.distributions import coverage_factor
 from calib.estimate.chain import Link, Passage, Smoothed, backward, forward, passed, solved
 from calib.estimate.innovation import Innovation, innovation
-from calib.estimate.physics import SIZE, STEP, Windows
+from calib.estimate.physics import SIZE, STEP, Stack, Windows
 from calib.estimate.quantities import KINDS, LAG, RESPONSE, Quantity
-from calib.estimate.record import Record
+from calib.estimate.record import Record, together
 from calib.estimate.rows import Degrees, Noise, Rows
 from calib.estimate.statements import Statements
 from calib.estimate.type_a import Index
@@ -149,8 +149,10 @@ class Now:
         """(3,) the part of the mean output that is not Q, in the pose of a record, and its derivatives (3, N)."""
         s = self.unknowns.statements
         p = s.of(record.reference)
-        told = p.reference_frequency_hz, p.reference_share, p.known_size
-        windows = Windows([record], s.temperature.reference_degc, None, *told)
+        windows = Windows(
+            Stack.of([record], fixed=False), s.temperature.reference_degc,
+            at_hz=p.reference_frequency_hz, share=p.reference_share, known_size=p.known_size,
+        )  # fmt: skip
         effect, taken_out = self.unknowns.effect(record, self.day)
         inputs = effect @ (self.mean - taken_out)
         live = np.flatnonzero(effect.any(axis=1))
@@ -255,7 +257,7 @@ def estimate(
     `start`: where the passes begin, if not at the priors; it does not change the result. `also`: days that get an epoch
     with or without a window. `noise`: None pools that of the records.
     """
-    records = sorted(records, key=lambda r: r.day)
+    records = together(sorted(records, key=lambda r: r.day), fixed=statements.held_mps2 is not None)
     unknowns = Unknowns(statements, records)
     days = distinct(np.array([*(r.day for r in records), *(d.day for d in statements.dated), *also], dtype=np.float64))
     if not len(days):

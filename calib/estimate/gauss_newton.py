@@ -20,6 +20,7 @@ ROUNDING = 1e-13  # of the scale: a smaller step is a rounding error
 # parameter known to 1 % by 1e-12 only, and small enough that a direction without excitation is not singular.
 UNBOUNDED = 1e4
 OFFSET_SCALE_MPS2 = 10.0  # scale of Q
+WIDE = 1e8  # ratio of the eigenvalues of a covariance, from which its inverse by elimination has too few digits
 PARAMETER_ROWS = [[3 * i, 3 * i + 1, 3 * i + 2, 9 + i] for i in range(3)]  # S_ix, S_iy, S_iz, Q_i
 
 
@@ -123,12 +124,20 @@ def _priors(equations: Equations, priors: Priors) -> tuple[Array, Array, Array, 
         bounded = np.isfinite(np.diag(priors.covariance)) & np.isfinite(priors.parameters)
         known = np.flatnonzero(bounded)
         mean[known] = priors.parameters[known]
-        precision[np.ix_(known, known)] = np.linalg.inv(priors.covariance[np.ix_(known, known)])
+        precision[np.ix_(known, known)] = _inverse(priors.covariance[np.ix_(known, known)])
     if not bounded[:9].all():
         # A column of S that was not excited is held at its scale. If it were free, it could take large values, and a
         # nuisance multiplied by it would then explain noise.
+        mean[:9] += np.where(bounded[:9], 0.0, equations.likely.ravel())
         for way in equations.unseen * np.array([1.0, 1.0, 1.0, 1.0 / OFFSET_SCALE_MPS2]):
             for row in PARAMETER_ROWS:
                 held = way / np.linalg.norm(way) / scale[row]
                 precision[np.ix_(row, row)] += np.outer(held, held)
     return scale, mean, precision, bounded
+
+
+def _inverse(covariance: Array) -> Array:
+    """The inverse (n, n) of a covariance (n, n), positive definite also where some combinations of the parameters are
+    known far better than others."""
+    values, ways = np.linalg.eigh(covariance)
+    return np.asarray((ways / values) @ ways.T if values[-1] > WIDE * values[0] else np.linalg.inv(covariance))

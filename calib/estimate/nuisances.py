@@ -117,9 +117,11 @@ class Priors(Stated):
     @property
     def output_per_mps2(self) -> float | None:
         """The sensor's scale in output unit per m/s2 by the main sensitivities that were known beforehand; None where
-        one of them was not."""
-        scale = np.nan if self.parameters is None else scale_of(self.parameters)
-        return scale if np.isfinite(scale) else None
+        one of them was not, or only in combinations."""
+        if self.parameters is None or self.covariance is None:
+            return None
+        scale, u = scale_of(self.parameters), np.sqrt(self.covariance.diagonal()[[0, 4, 8]])
+        return scale if np.isfinite(scale) and (u < scale).all() else None
 
     @property
     def beside_unknown_corner(self) -> Priors:

@@ -21,17 +21,20 @@ hand.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib.estimate.record import TERMS, TOLD, Record
+from calib.estimate.record import TERMS, Record
 from calib.estimate.type_a import Index
 from calib.model import Array, own_channels
 from calib.signal.response import by_term
 
+Flags = NDArray[np.bool_]
 STEP = 1e-30  # of the complex step: its square is lost beside 1, so that the derivative is exact
+AT_ONCE = 20_000  # windows times inputs whose derivatives are found together: some 50 MB
 _PARTS = {
     "S": 9, "Q": 3, "STRETCH": 3, "TURN": 3, "TURN_GRAVITY": 3, "ACROSS": 3, "AHEAD": 3, "LAG": 3, "CORNER": 1,
     "GRAVITY": 1, "REFERENCE": 3, "RESPONSE": TERMS, "OVER_T": 6,
@@ -44,77 +47,91 @@ SIZE = _ENDS[-1]  # of the inputs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mount:
-    """A mount that never turns against gravity: the mean input acceleration `held_mps2` (3,) acts all the time, so that
-    the mean of V is one number for each axis. It takes the place of Q: Q = mean - S held is computed when it is read.
-    If Q itself were an unknown, a mean that drifts would move the column of S along gravity.
+class Stack:
+    """What the physics needs of W windows with M channels and k rows of means, each (W, ...), under the names that
+    calib.estimate.record.Record has for them. `direction` (W, 3, M) and `gravity_mps2` (W, 3) as stated, NaN where
+    nobody stated gravity; `response` (W, TERMS). `excited` (W, 3, 3) is the identity where all directions count."""
 
-    `nominal` (3, 3): S before any data. It takes the place of S along directions that a window did not excite, since
-    what moved there is mostly noise of the reference.
-    """
-
-    nominal: Array
+    direction: Array
+    gravity_mps2: Array
+    along: Array
+    along_rate_s: Array
+    excited: Array
+    root: Array
+    slopes: Array
+    passed: Array
+    omega2: Array
+    noise: Array
+    mean_x: Array
+    means: Array
+    over_t: Array
+    temperature_degc: Array
     held_mps2: Array
+    response: Array
+
+    @classmethod
+    def of(cls, records: Sequence[Record], *, fixed: bool) -> Stack:
+        """That of records with equal numbers of channels and rows. `fixed`: they are of a mount that never turns."""
+        same = {f.name for f in fields(cls)} & {f.name for f in fields(Record)}
+        own = {name: [getattr(r, name) for r in records] for name in same}
+        own["direction"] = [padded(r.pose.direction, r.channels) for r in records]
+        own["gravity_mps2"] = [r.pose.gravity_mps2 for r in records]
+        own["response"] = [np.pad(np.array(r.response), (0, TERMS - len(r.response))) for r in records]
+        own["excited"] = [r.excited if fixed or r.planar else np.eye(3) for r in records]
+        return cls(**{name: np.array(values) for name, values in own.items()})
+
+
+def padded(direction: Array, channels: int) -> Array:
+    """A direction (3, m) with columns of zeros for the channels that a window does not have."""
+    return np.pad(direction, ((0, 0), (0, channels - direction.shape[1])))
 
 
 class Windows:
-    """The records of W windows with equal numbers of channels and rows, stacked (W, ...)."""
+    """W windows with equal numbers of channels and rows: what they show for given inputs.
+
+    Along directions that a window did not excite its motion is mostly noise of the reference; there S is taken as
+    `nominal` (3, 3). None: all directions count.
+
+    `held_mps2` (3,): the mean input acceleration of a mount that never turns against gravity, which acts all the time.
+    The mean of V is then one number for each axis, and takes the place of Q: Q = mean - S held is computed when it is
+    read. If Q itself were an unknown, a mean that drifts would move the column of S along gravity. None: a mount that
+    turns.
+    """
 
     def __init__(
         self,
-        records: Sequence[Record],
-        zero_degc: float,
-        mount: Mount | None,
+        stack: Stack,
+        zero_degc: float = 0.0,
+        nominal: Array | None = None,
+        held_mps2: Array | None = None,
+        *,
         at_hz: float,
         share: float,
         known_size: float,
     ) -> None:
-        """`zero_degc` is the temperature of S and Q. `mount`: the mount if it never turns, else None.
-
-        S holds at the frequency `at_hz`; of ln |h| the part 1 - `share` is the sensor's, which has known filters of
-        size exp(`known_size`) there.
-        """
-        self.records, self.channels = records, records[0].channels
-        m, real = self.channels, own_channels(self.channels)
-        self.root, self.slopes, self.passed = (self._stack(name) for name in ("root", "slopes", "passed"))
-        self.noise, self.mean_x, self.means = (self._stack(name) for name in ("noise", "mean_x", "means"))
-        self.along, self.along_rate = self._stack("along"), self._stack("along_rate_s")
-        self.excited = np.tile(np.eye(3), (len(records), 1, 1)) if mount is None else self._stack("excited")
-        self.silent = (np.eye(3) if mount is None else mount.nominal) @ (np.eye(3) - self.excited)
-        self.away = None if mount is None else np.nan_to_num(self._stack("held_mps2") - mount.held_mps2)
-        self.told = np.zeros((len(records), TOLD, TERMS + 1))
-        for own, record in zip(self.told, records, strict=True):
-            own[: len(record.told)] = record.told
-        self.direction = np.zeros((len(records), 3, m))
-        for own, record in zip(self.direction, records, strict=True):
-            own[:, : record.pose.direction.shape[1]] = record.pose.direction
-        gravity = np.array([record.pose.gravity_mps2 for record in records])
-        self.known = np.isfinite(gravity).all(axis=1)  # else the means have no information, and get no weight
-        self.gravity = np.where(self.known[:, None], gravity, 0.0)
-        self.magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
-        degc = self._stack("temperature_degc")
-        self.told_degc = np.isfinite(degc)
-        self.over_zero = np.where(self.told_degc, degc - zero_degc, 0.0)
-        self.over_t = _about(self._stack("over_t"), np.where(self.told_degc, zero_degc, 0.0))
-        self.omega2 = self._stack("omega2")
-        omega = np.sqrt(self.omega2)
+        """`zero_degc` is the temperature of S and Q. S holds at the frequency `at_hz`; of ln |h| the part 1 - `share`
+        is the sensor's, which has known filters of size exp(`known_size`) there."""
+        self.stack, self.channels = stack, stack.along.shape[1]
+        self.silent = np.zeros((3, 3)) if nominal is None else nominal @ (np.eye(3) - stack.excited)
+        self.away = None if held_mps2 is None else np.nan_to_num(stack.held_mps2 - held_mps2)
+        self.known: Flags = np.isfinite(stack.gravity_mps2).all(
+            axis=1
+        )  # else the means tell nothing, and get no weight
+        self.gravity = np.where(self.known[:, None], stack.gravity_mps2, 0.0)
+        self.told_degc: Flags = np.isfinite(stack.temperature_degc[:, None]).all(axis=1)
+        self.over_zero = np.where(self.told_degc, stack.temperature_degc - zero_degc, 0.0)
+        self.over_t = _about(stack.over_t, np.where(self.told_degc, zero_degc, 0.0))
+        omega = np.sqrt(stack.omega2)
         self.per_omega = np.divide(1.0, omega, out=np.zeros_like(omega), where=omega > 0.0)
         self.at_hz = (1.0 - share) * by_term(np.array([2.0 * np.pi * at_hz]), TERMS)[0].real
-        taken = np.zeros((len(records), TERMS))
-        for own, record in zip(taken, records, strict=True):
-            own[: len(record.response)] = record.response
-        self.removed = taken @ self.at_hz + known_size
-        self.channel = np.resize(np.arange(max(real, 1)), m)  # integrals have the error of their own channel
-        self._real, self._first = real, np.eye(1, m)[0]
-
-    def _stack(self, name: str) -> Array:
-        return np.array([getattr(record, name) for record in self.records])
+        self.removed = stack.response @ self.at_hz + known_size
 
     @property
     def moved(self) -> Array:
         """(W, 2M, 3) derivatives of the slopes of an axis by its row of S, with angles as stated."""
-        direction = np.concatenate([self.direction @ self.along, self.direction @ self.along_rate], axis=2)
-        return np.asarray(self.root @ direction.mT)
+        own = self.stack
+        direction = np.concatenate([own.direction @ own.along, own.direction @ own.along_rate_s], axis=2)
+        return np.asarray(own.root @ direction.mT)
 
     def predicted(self, p: Array) -> tuple[Array, Array]:
         """Slopes R b (..., W, 2M, 3) and means (..., W, k, 3) for inputs (..., W, SIZE)."""
@@ -138,36 +155,30 @@ class Windows:
         return self._under_gravity(p, at_0hz, *self._motion(p))
 
     def _under_gravity(self, p: Array, s: Array, direction: Array, ahead: Array) -> Array:
-        gravity = (rotation(p[..., TURN_GRAVITY]) @ self.gravity[..., None])[..., 0]
-        output = _times(s, gravity * (1.0 + p[..., GRAVITY] / self.magnitude[:, None]))
+        output = _times(s, felt_gravity(p, self.gravity))
         if self.channels:
-            mean, rate = np.split(self.mean_x, 2, axis=1)
+            mean, rate = np.split(self.stack.mean_x, 2, axis=1)
             output = output + _times(s, _times(direction, mean) + ahead * rate[:, :1])
             output = output - p[..., LAG] * _times(s, _times(direction, rate))
         return output
 
     def _motion(self, p: Array) -> tuple[Array, Array]:
         """D (..., W, 3, M), for means and motion that each channel has by itself, and R q / omega (..., W, 3)."""
-        turn = rotation(p[..., TURN])
-        ahead = _times(turn, p[..., AHEAD]) * self.per_omega[:, None]
-        if not self.channels:
-            return np.zeros((*p.shape[:-1], 3, 0)), ahead
-        sideways = self.direction + p[..., ACROSS][..., None] * self._first
-        felt = turn @ sideways[..., : self._real]
-        felt = np.concatenate([felt, p[..., CORNER][..., None] * felt], axis=-1)[..., : self.channels]
-        return felt / (1.0 + p[..., REFERENCE][..., self.channel])[..., None, :], ahead
+        ahead = _times(rotation(p[..., TURN]), p[..., AHEAD]) * self.per_omega[:, None]
+        return felt_motion(p, self.stack.direction), ahead
 
     def _slopes(self, p: Array, s: Array, direction: Array, ahead: Array, left: Array) -> Array:
         if not self.channels:
             return np.zeros((*p.shape[:-1], 0, 3))
-        s, lag = s @ self.excited + self.silent, p[..., LAG]
-        ideal = s @ (direction @ self.along)
-        on_u = ideal * (1.0 - 0.5 * lag**2 * self.omega2[:, None])[..., None]
-        on_rate = s @ (direction @ self.along_rate) - ideal * lag[..., None]
-        on_rate = on_rate + _times(s, ahead)[..., None] * self._first
-        slopes = self.root @ np.concatenate([on_u - left[..., None, None] * ideal, on_rate], axis=-1).mT
-        if self.passed.any():
-            flat = self.passed.reshape(len(self.passed), TERMS, -1)
+        own, lag = self.stack, p[..., LAG]
+        s = s @ own.excited + self.silent
+        ideal = s @ (direction @ own.along)
+        on_u = ideal * (1.0 - 0.5 * lag**2 * own.omega2[:, None])[..., None]
+        on_rate = s @ (direction @ own.along_rate_s) - ideal * lag[..., None]
+        on_rate = on_rate + _times(s, ahead)[..., None] * np.eye(1, self.channels)[0]
+        slopes = own.root @ np.concatenate([on_u - left[..., None, None] * ideal, on_rate], axis=-1).mT
+        if own.passed.any():
+            flat = own.passed.reshape(len(own.passed), TERMS, -1)
             added = (p[..., RESPONSE][..., None, :] @ flat)[..., 0, :]
             slopes = slopes + added.reshape(*p.shape[:-1], 2 * self.channels, self.channels) @ ideal.mT
         return np.asarray(slopes)
@@ -175,12 +186,36 @@ class Windows:
     def linear(self, p: Array, near: Array, live: Index) -> tuple[Array, Array, Array, Array]:
         """Residuals, observed less predicted, of slopes (W, 6M) and means (W, 3k) at inputs `p` (W, SIZE); and their
         derivatives (W, ..., L) by the inputs numbered `live` (L,), at inputs `near` (W, SIZE)."""
-        step = np.zeros((len(live), 1, SIZE), complex)
-        step[range(len(live)), 0, live] = 1j * STEP
-        w, found, moved = len(p), self.predicted(p), self.predicted(near + step)
-        slope, mean = ((told - x).reshape(w, -1) for told, x in zip((self.slopes, self.means), found, strict=True))
-        d_slope, d_mean = (np.moveaxis(x.imag.reshape(len(live), w, -1), 0, -1) / STEP for x in moved)
+        w, told = len(p), (self.stack.slopes, self.stack.means)
+        slope, mean = ((observed - x).reshape(w, -1) for observed, x in zip(told, self.predicted(p), strict=True))
+        d_slope, d_mean = (np.zeros((*left.shape, len(live))) for left in (slope, mean))
+        for part in np.array_split(np.arange(len(live)), -(-len(live) * w // AT_ONCE) or 1):
+            step = np.zeros((len(part), 1, SIZE), complex)
+            step[range(len(part)), 0, live[part]] = 1j * STEP
+            for found, x in zip((d_slope, d_mean), self.predicted(near + step), strict=True):
+                found[..., part] = np.moveaxis(x.imag.reshape(len(part), w, -1), 0, -1) / STEP
         return slope, mean, d_slope, d_mean
+
+
+def felt_motion(p: Array, direction: Array) -> Array:
+    """D (..., 3, M) for inputs (..., SIZE) and directions as stated (..., 3, M).
+
+    A corner of c Hz removed c times the integral; the integrals are channels of their own (calib.signal.corner).
+    """
+    channels = direction.shape[-1]
+    real = own_channels(channels)
+    sideways = direction + p[..., ACROSS][..., None] * np.eye(1, channels)[0]
+    felt = rotation(p[..., TURN]) @ sideways[..., :real]
+    felt = np.concatenate([felt, p[..., CORNER][..., None] * felt], axis=-1)[..., :channels]
+    channel = np.resize(np.arange(max(real, 1)), channels)  # integrals have the error of their own channel
+    return np.asarray(felt / (1.0 + p[..., REFERENCE][..., channel])[..., None, :])
+
+
+def felt_gravity(p: Array, gravity: Array) -> Array:
+    """G (..., 3) for inputs (..., SIZE) and gravity as stated (..., 3) in m/s2."""
+    magnitude = np.maximum(np.linalg.norm(gravity, axis=-1), np.finfo(float).tiny)
+    turned = _times(rotation(p[..., TURN_GRAVITY]), gravity)
+    return np.asarray(turned * (1.0 + p[..., GRAVITY] / magnitude[..., None]))
 
 
 def rotation(v: Array) -> Array:

@@ -6,7 +6,7 @@ of the samples (a lag, a response, noise), which is stated. So a changed stateme
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -18,7 +18,7 @@ from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.never_turned import mean_input
 from calib.estimate.type_a import FEWEST_FREEDOM
 from calib.excitation.bands import motion_band_hz
-from calib.excitation.excited import excited
+from calib.excitation.excited import Motion, excited, excited_together, excited_ways, motion_of
 from calib.model import Array, Pose, Window
 from calib.signal.response import ALL_POWERS
 
@@ -50,7 +50,8 @@ class Record:
 
     Response: `told` (r, TERMS + 1): rows of its terms alone; `deviations` and `left_open`: what the bands say beside.
     `motion_hz`: the band of the motion, None where it tells no response; `mean_hz` its mean frequency, 0 at rest.
-    `misfit` (2,): chi-squared by which the slopes of merged windows differ, and its degrees of freedom.
+    `misfit` (2,): chi-squared by which the slopes of merged windows differ, and its degrees of freedom. `motion`: that
+    of a window whose directions the noise of the reference turns (see `together`), None of any other.
     """
 
     pose: Pose
@@ -85,6 +86,7 @@ class Record:
     motion_hz: tuple[float, float] | None
     mean_hz: float
     misfit: tuple[float, float] = (0.0, 0.0)
+    motion: Motion | None = None
 
     @classmethod
     def of(
@@ -99,6 +101,8 @@ class Record:
         """The record of a window that is used. Its bands up to `to_hz` tell the response over frequency; where no
         window before settled that, those of its own motion."""
         found = excited(window)
+        if found.turned:
+            found = excited_together([window])[0][0]
         motion_hz = motion_band_hz([window])
         if motion_hz is not None and to_hz == np.inf:
             to_hz = WIDER * motion_hz[1]
@@ -129,13 +133,18 @@ class Record:
             data.root[0], data.slopes[0], passed, float(data.omega2[0]), type_a.noise[0], own * ratio + 1.0 - own,
             freedom, data.mean_x[0], data.mean_v[0][None], np.array([[1.0, t, t * t]]), temperature_degc,
             mean_input(window), float(data.count[0]), told, deviations, left_open,
-            motion_hz, mean_frequency_hz(data),
+            motion_hz, mean_frequency_hz(data), motion=motion_of(window) if found.turned else None,
         )  # fmt: skip
 
     @property
     def channels(self) -> int:
         """M."""
         return len(self.along)
+
+    @property
+    def planar(self) -> bool:
+        """Whether S counts only along the directions that all windows excite together."""
+        return self.motion is not None
 
     @property
     def rows(self) -> int:
@@ -181,15 +190,34 @@ class Record:
         """Plain values and arrays, for `load`."""
         held = {f.name: getattr(self, f.name) for f in fields(self)}
         pose = {f.name: getattr(self.pose, f.name) for f in fields(self.pose)}
-        return held | {"pose": pose, "deviations": asdict(self.deviations), "left_open": asdict(self.left_open)}
+        motion = None if self.motion is None else asdict(self.motion)
+        told = {"deviations": asdict(self.deviations), "left_open": asdict(self.left_open)}
+        return held | {"pose": pose, "motion": motion} | told
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> Record:
         """The record whose snapshot this is."""
         pairs = {name: tuple(state[name]) for name in ("days", "response", "misfit")}
-        band = state["motion_hz"]
+        band, motion = state["motion_hz"], state.get("motion")
         own = {
             "pose": Pose(**state["pose"]), "deviations": Deviations(**state["deviations"]),
             "left_open": LeftOpen.load(state["left_open"]), "motion_hz": None if band is None else (band[0], band[1]),
+            "motion": None if motion is None else Motion(**motion),
         }  # fmt: skip
         return cls(**{**state, **pairs, **own})
+
+
+def together(records: Sequence[Record], *, fixed: bool) -> list[Record]:
+    """The records; of those whose directions noise turns, each with the directions that all of them excite together.
+
+    Noise turns the directions of each window another way: from these small differences least squares would tell S in
+    the direction that nothing excited (calib.excitation.excited). Where all directions are excited together, each
+    window counts in all of them, or in its own at a mount that is `fixed`.
+    """
+    moved = [r.motion for r in records if r.motion is not None]
+    whole = any(np.trace(r.excited) > 2.5 for r in records if r.motion is None)
+    ways = excited_ways(moved) if moved and not whole else np.eye(3)
+    if ways.shape[1] == 3 and (fixed or not moved):
+        return list(records)
+    excited_by_all = np.round(ways @ ways.T, 6) + 0.0
+    return [r if r.motion is None else replace(r, excited=excited_by_all) for r in records]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.estimate import physics
-from calib.estimate.physics import Windows
+from calib.estimate.physics import Stack, Windows
 from calib.estimate.quantities import offset_temperature
-from calib.estimate.record import Record
+from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
 from calib.estimate.type_a import LEAST_INFLATION
 from calib.estimate.unknowns import Unknowns
@@ -89,11 +89,15 @@ class Rows:
         self._count, self._groups = len(records), list[_Group]()
         for (_, _, hz, share, size, told), at in by.items():
             own = [records[w] for w in at]
-            windows = Windows(own, s.temperature.reference_degc, s.mount, hz, share, size)
+            stack = Stack.of(own, fixed=s.held_mps2 is not None)
+            degc, nominal, held = s.temperature.reference_degc, s.nominal, s.held_mps2
+            windows = Windows(stack, degc, nominal, held, at_hz=hz, share=share, known_size=size)
             pairs = [unknowns.effect(records[w], float(epoch_day[w])) for w in at]
             effect, taken_out = np.array([e for e, _ in pairs]), np.array([a for _, a in pairs])
-            slopes, means = _slope_weights(windows, unknowns, noise), _mean_weights(windows, unknowns, noise, degrees)
-            self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, told))
+            slopes = _slope_weights(own, windows, unknowns, noise)
+            means = _mean_weights(own, windows, unknowns, noise, degrees)
+            by_bands = _told(own) if told else None
+            self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, by_bands))
 
     def at(self, x: Array, around: Array) -> list[Array]:
         """Rows (r, N + 1) [derivatives | observed less predicted] of each record at the values x (W, N); the
@@ -118,7 +122,7 @@ class _Group:
     taken_out: Array
     slope_weights: Array
     mean_weights: Array
-    told: bool
+    told: Array | None
 
     def rows(self, x: Array, around: Array) -> Array:
         p, near = ((self.effect @ (values - self.taken_out)[..., None])[..., 0] for values in (x, around))
@@ -129,16 +133,24 @@ class _Group:
             self.slope_weights @ np.concatenate([d_slope @ on, slope[..., None]], axis=2),
             self.mean_weights @ np.concatenate([d_mean @ on, mean[..., None]], axis=2),
         ]
-        if self.told:
-            moves, left = self.windows.told[..., :-1], self.windows.told[..., -1:]
+        if self.told is not None:
+            moves, left = self.told[..., :-1], self.told[..., -1:]
             left = left - moves @ p[:, physics.RESPONSE, None]
             parts.append(np.concatenate([moves @ self.effect[:, physics.RESPONSE], left], axis=2))
         return np.concatenate(parts, axis=1)
 
 
-def _slope_weights(windows: Windows, unknowns: Unknowns, noise: Noise) -> Array:
+def _told(records: Sequence[Record]) -> Array:
+    """(W, TOLD, TERMS + 1) what the bands of each record tell of the response."""
+    found = np.zeros((len(records), TOLD, TERMS + 1))
+    for own, record in zip(found, records, strict=True):
+        own[: len(record.told)] = record.told
+    return found
+
+
+def _slope_weights(records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise) -> Array:
     """(W, 6M, 6M) by what the slopes of W windows are multiplied, so that their covariance is one."""
-    s, records, n = unknowns.statements, windows.records, 6 * windows.channels
+    s, n = unknowns.statements, 6 * windows.channels
     if not n:
         return np.zeros((len(records), 0, 0))
     merged, stretch = _merged(records)
@@ -149,27 +161,29 @@ def _slope_weights(windows: Windows, unknowns: Unknowns, noise: Noise) -> Array:
     white = _white(noise.slopes, records)
     # What nobody knows of S along directions that were not excited, by the little that moved there.
     unknown = np.minimum(s.u[:9], FLAT * s.scale).reshape(3, 3)
-    silent = windows.moved @ (np.eye(3) - windows.excited)
-    missed = (np.sqrt(silent**2 @ unknown.T**2) / windows.noise[:, None]).reshape(len(records), n)
+    silent = windows.moved @ (np.eye(3) - windows.stack.excited)
+    missed = (np.sqrt(silent**2 @ unknown.T**2) / windows.stack.noise[:, None]).reshape(len(records), n)
     covariance = white[:, None, None] * np.eye(n) + missed[..., None] ** 2 * np.eye(n) + loaded @ loaded.mT
     if stretch.any():
         walks = np.sqrt(unknowns.a_day[[0, 4, 8]])
-        each = windows.moved[:, :, None, :] * walks[:, None] / windows.noise[:, None, :, None]
+        each = windows.moved[:, :, None, :] * walks[:, None] / windows.stack.noise[:, None, :, None]
         for i in range(3):
             covariance[:, i::3, i::3] += stretch[:, None, None] * (each[:, :, i] @ each[:, :, i].mT)
     inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-    return np.asarray(inverse / np.tile(windows.noise, n // 3)[:, None])
+    return np.asarray(inverse / np.tile(windows.stack.noise, n // 3)[:, None])
 
 
-def _mean_weights(windows: Windows, unknowns: Unknowns, noise: Noise, degrees: Degrees) -> Array:
+def _mean_weights(
+    records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise, degrees: Degrees
+) -> Array:
     """(W, 3k, 3k) by what the means of W windows are multiplied, so that their covariance is one; 0 where nobody stated
     gravity."""
-    s, records, k = unknowns.statements, windows.records, windows.means.shape[1]
+    s, k = unknowns.statements, windows.stack.means.shape[1]
     merged, stretch = _merged(records)
-    white = _white(noise.means, records)[:, None] * windows.noise**2
+    white = _white(noise.means, records)[:, None] * windows.stack.noise**2
     white *= (merged / np.array([r.count for r in records]))[:, None]
     between = np.array([(s.of(r.reference).offset_mps2 * s.scale) ** 2 for r in records])[:, None] + np.zeros(3)
-    walked = unknowns.a_day[9:] + np.outer(windows.magnitude**2, unknowns.a_day[[0, 4, 8]])
+    walked = unknowns.a_day[9:] + np.outer(np.linalg.norm(windows.gravity, axis=1) ** 2, unknowns.a_day[[0, 4, 8]])
     between = between + (stretch * merged)[:, None] * walked
     covariance = (white + between)[..., None] * np.eye(3)
     covariance = covariance + np.where(windows.told_degc[:, None, None], 0.0, degrees.covariance)

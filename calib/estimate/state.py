@@ -22,7 +22,7 @@ from calib.estimate.never_turned import never_turned
 from calib.estimate.nuisances import Priors
 from calib.estimate.over_frequency import OverFrequency, changed
 from calib.estimate.quantities import ALL_RATES, KINDS, LAG, PRIORS, S_AND_Q, Quantity
-from calib.estimate.record import Record
+from calib.estimate.record import Record, together
 from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
 from calib.estimate.rows import Noise
@@ -145,8 +145,12 @@ class State:
             at = ahead.mean.copy()
             if (k := ahead.unknowns.at.get(_lag_of(record.reference))) is not None:
                 at[k] = record.lag_s
-        rows = ahead.rows(record, at)
+        rows = ahead.rows(trial._directed(record), at)
         return ahead.says(rows), trial, ahead, rows
+
+    def _directed(self, record: Record) -> Record:
+        """A window with the directions that it excites, as all windows until now tell them."""
+        return together([*self._records, record], fixed=self._fixed)[-1] if record.planar else record
 
     def _key(self, name: str) -> str:
         """The key of an unknown of the sensor, its mount, or the reference in use by its name or its key."""
@@ -370,7 +374,7 @@ class State:
         """Take a window."""
         self.close_day(record.day)
         ahead = self._know(record)
-        self._take(record, ahead, ahead.rows(record))
+        self._take(record, ahead, ahead.rows(self._directed(record)))
 
     def close_day(self, day: float) -> bool:
         """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns
@@ -379,7 +383,8 @@ class State:
             return False
         self._newest_day = int(np.floor(day))
         cuts = [step.day for step in self._steps if any(not key.startswith("lag") for key in step.u)]
-        self._records = _newest(thinned(self._records, day, self._now.mean[:9].reshape(3, 3), cuts))
+        records = together(self._records, fixed=self._fixed)
+        self._records = _newest(thinned(records, day, self._now.mean[:9].reshape(3, 3), cuts))
         self.solve()
         return True
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.physics import Mount
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array, scale_of
 
@@ -44,7 +43,7 @@ class Statements:
     """`mean`, `u` (12,): of S and Q before any data, in output units. `priors`: of the nuisances, by the identity of
     the reference; that of "" holds beside any other one. `places`: at which place a reference is mounted. `certified`:
     the days of their certificates. `held_mps2` (3,): the mean input acceleration of a mount that never turns against
-    gravity; Q is then the mean output (calib.estimate.physics.Mount). None: the mount turns.
+    gravity; Q is then the mean output (calib.estimate.physics.Windows). None: the mount turns.
     """
 
     mean: Array
@@ -64,10 +63,9 @@ class Statements:
         return scale_of(self.mean)
 
     @property
-    def mount(self) -> Mount | None:
-        """The mount if it never turns."""
-        nominal = self.mean[:9].reshape(3, 3)
-        return None if self.held_mps2 is None else Mount(nominal, self.held_mps2)
+    def nominal(self) -> Array:
+        """(3, 3) S before any data."""
+        return self.mean[:9].reshape(3, 3)
 
     def of(self, reference: str) -> Priors:
         """What is stated beside a reference."""

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 
 from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.record import TERMS, TOLD, Record
+from calib.excitation.excited import Motion
 from calib.model import Array
 
 NEWEST = 48  # records that stay as they are: four times round twelve positions
@@ -35,7 +37,7 @@ def thinned(records: Sequence[Record], now: float, nominal: Array, cuts: Sequenc
         degc = np.floor(r.temperature_degc / BIN_K) if np.isfinite(r.temperature_degc) else None
         key = (
             width, int(r.day // width), sum(r.day >= day for day in cuts), r.setting, r.excited.tobytes(), r.response,
-            degc, r.motion_hz is None,
+            degc, r.motion_hz is None, r.planar,
         )  # fmt: skip
         buckets.setdefault(key, []).append(r)
     return sorted((merged(own, nominal) for own in buckets.values()), key=lambda r: r.day) + new
@@ -63,6 +65,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
     freedom = np.array([r.freedom for r in records])
     by = freedom / freedom.sum() if freedom.sum() else share
     deviations, left_open = Deviations(), LeftOpen()
+    motions = [r.motion for r in records if r.motion is not None]
     for r in records:
         deviations, left_open = deviations.plus(r.deviations), left_open.plus(r.left_open)
     return replace(
@@ -82,6 +85,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
             sum(r.misfit[0] for r in records) + float(np.sum((left / noise) ** 2)),
             sum(r.misfit[1] for r in records) + 3.0 * rank * (len(records) - 1),
         ),
+        motion=reduce(Motion.plus, motions) if motions else None,
     )  # fmt: skip
 
 

@@ -50,7 +50,7 @@ def reasons(
         or _response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nuisance_reasons(solution, shares.covariance)
-        or _nothing_determined(solution, determined)
+        or nothing_determined(solution, determined)
         or _sensitivity_reasons(solution, shares, determined)
         or _short_reasons(windows)
     )
@@ -97,18 +97,35 @@ def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
     return []
 
 
-def _nothing_determined(solution: Solution, determined: Flags) -> list[str]:
+def nothing_determined(solution: Solution, determined: Flags) -> list[str]:
+    """The reason why the data determine none of the parameters; empty where they determine one."""
     if determined.any():
         return []
-    if solution.bounded.any() and solution.equations.rank == 4:
+    equations = solution.equations
+    if solution.bounded.any() and equations.rank == 4:
         return [
             "the data add too little to the priors: they halve the standard uncertainty of no parameter; "
             "measure longer, with more motion or in more positions"
         ]
+    where = where_nothing_moved(equations.unexcited)
     return [
-        f"rank {solution.equations.rank} of 4: the data determine none of the 12 parameters; "
-        "measure with more motion or in more positions"
+        f"rank {equations.rank} of 4: the data determine none of the 12 parameters"
+        f"{': ' if where else ''}{where}; measure with more motion or in more positions"
     ]
+
+
+def where_nothing_moved(unexcited: Array) -> str:
+    """A sentence on the directions (k, 3) in the sensor's frame that nothing excites; "" where there is no motion, or
+    motion in all directions."""
+    if len(unexcited) == 1:
+        return f"the motion is in a plane, and nothing moves along its normal {_in_axes(unexcited[0])}"
+    if len(unexcited) == 2:
+        return f"all motion is along one direction, {_in_axes(np.cross(*unexcited))}"
+    return ""
+
+
+def _in_axes(direction: Array) -> str:
+    return f"({', '.join(f'{round(part, 3):g}' for part in direction)}) in the sensor's axes x, y, z"
 
 
 def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
@@ -192,17 +209,17 @@ def _prior_reasons(solution: Solution) -> list[str]:
     known = np.flatnonzero(solution.bounded)
     if not known.size:
         return []
-    before = np.linalg.inv(solution.prior_precision[np.ix_(known, known)])
-    root = np.linalg.cholesky(before)
-    pull = np.linalg.solve(root, solution.x[known] - solution.prior_mean[known])
-    left = np.linalg.solve(root, np.linalg.solve(root, (solution.half[known] @ solution.half[known].T)).T)
-    removed, ways = np.linalg.eigh(np.eye(len(known)) - left)
+    precision, axes = np.linalg.eigh(solution.prior_precision[np.ix_(known, known)])
+    inverse = np.sqrt(precision)[:, None] * axes.T  # of a factor of the covariance before
+    pull = inverse @ (solution.x[known] - solution.prior_mean[known])
+    left = inverse @ solution.half[known]
+    removed, ways = np.linalg.eigh(np.eye(len(known)) - left @ left.T)
     tested = removed > PRIOR_SHARE
     statistic = float(np.sum((ways.T @ pull)[tested] ** 2 / removed[tested]))
     limit = chi2_quantile(CONTRADICTED, float(tested.sum()))
     if statistic <= limit or not tested.any():
         return []
-    u = np.sqrt(np.diag(before))
+    u = np.linalg.norm(axes / np.sqrt(precision), axis=1)
     worst = int(np.argmax(np.abs(solution.x[known] - solution.prior_mean[known]) / u))
     p = known[worst]
     S, S_known = (values[:9].reshape(3, 3) for values in (solution.x, solution.prior_mean))

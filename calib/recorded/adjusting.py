@@ -17,9 +17,10 @@ from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_by_band import told_by_band
 from calib.estimate.response_told import LEFT_U, ResponseTold
 from calib.excitation.bands import lowest_hz, motion_band_hz
+from calib.excitation.excited import excited_together
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
-from calib.model import PARAMETERS, Window
+from calib.model import PARAMETERS, Array, Window
 from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.options import Options
 from calib.recorded.outcome import NuisanceValue, Outcome, nothing_used
@@ -187,7 +188,9 @@ def over_frequency(priors: Priors, windows: Sequence[Window], lag_s: float) -> P
     told, moved = with_response(priors, windows), [w for w in _used(windows) if w.kind == "motion"]
     if told.response or not moved:
         return told
-    motion_hz = mean_frequency_hz(condense(moved, response_hz=np.inf, one_frequency=True))
+    found, _ = excited_together(moved)
+    used = [w if e.live.all() else e for w, e in zip(moved, found, strict=True)]  # noise has a frequency of its own
+    motion_hz = mean_frequency_hz(condense(used, response_hz=np.inf, one_frequency=True))
     return priors.at_one_frequency(motion_hz, lag_s) if motion_hz else priors
 
 
@@ -228,7 +231,7 @@ def norm_fitted(sensor: SensorTable, options: Options) -> Outcome:
 
 
 def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Outcome:
-    reasons = _hardly_used(windows) or found.reasons
+    reasons, joint = _hardly_used(windows) or found.reasons, found.joint
     nuisances = [NuisanceValue(n.name, n.value, n.standard_uncertainty, n.unit) for n in found.nuisances]
     return Outcome(
         None if reasons else found.calibration, reasons, windows, rate_hz, found.calibration.method,
@@ -251,8 +254,14 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Ou
             "nuisance_pull": found.nuisance_pull,
             **_response(found.response),
             "invariant": None if reasons else found.invariant,
+            "unexcited_directions": found.grounds.solution.equations.unexcited,
+            "joint": None if joint is None else _joint(*joint),
         },
     )  # fmt: skip
+
+
+def _joint(values: Array, covariance: Array) -> dict[str, Any]:
+    return {"sensitivity": values[:9].reshape(3, 3), "offset": values[9:], "covariance": covariance}
 
 
 def _response(told: ResponseTold | None) -> dict[str, Any]:

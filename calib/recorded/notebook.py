@@ -76,8 +76,11 @@ def _rotation(given: Any) -> Array:
 
 
 def _prior(given: Any) -> tuple[Array, Array]:
-    """The prior from a result, a Calibration, or the object that `json.loads` makes of a result."""
+    """The prior from a result, a Calibration, or the object that `json.loads` makes of a result; with what a result
+    knows of combinations of elements of S."""
     names = ("sensitivity", "offset", "covariance")
+    members = given if isinstance(given, Mapping) else getattr(given, "more", {})
+    given = members.get("joint") or given
     try:
         told = [given[name] if isinstance(given, Mapping) else getattr(given, name) for name in names]
         S, Q, covariance = (np.array(each, dtype=float) for each in told)

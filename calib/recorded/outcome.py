@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calib import __version__
 from calib.estimate.response_told import BandSensitivity
+from calib.estimate.verdict import where_nothing_moved
 from calib.model import Array, Calibration, Window
 from calib.recorded.output_unit import shown_in
 from calib.rounding import KNOWN_BEFORE, from_to, plus_minus
@@ -116,6 +117,11 @@ class Outcome:
         band = self.more.get("valid_band_hz")
         within = f"; from {from_to(*band)} Hz it is right within a third of U" if band else ""
         return f"S holds at {self.reference_frequency_hz:.3g} Hz{within}"
+
+    @property
+    def where_nothing_moved(self) -> str:
+        """The directions that nothing excited, as a sentence; "" where all were."""
+        return where_nothing_moved(np.reshape(self.more.get("unexcited_directions", ()), (-1, 3)))
 
     @property
     def response(self) -> tuple[BandSensitivity, ...]:

@@ -67,7 +67,7 @@ def rows_of(outcome: Outcome) -> list[tuple[str, ...]]:
 
 
 def notes_of(outcome: Outcome) -> Iterator[str]:
-    """Units and k, what was known before, and where S holds, each as a sentence without its full stop."""
+    """Units and k, what was known before, where S holds and what did not move, as sentences without full stop."""
     shown = shown_in(outcome.unit)
     kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
     yield f"{shown.words}, U with k = {outcome.coverage_factor:.3g}{kind}"
@@ -75,6 +75,8 @@ def notes_of(outcome: Outcome) -> Iterator[str]:
         yield f"{KNOWN_BEFORE} known before: the data do not halve its uncertainty"
     if outcome.where_it_holds:
         yield outcome.where_it_holds
+    if outcome.where_nothing_moved:
+        yield outcome.where_nothing_moved
     if at_rest := _at_0hz(outcome, shown.factors):
         yield f"at 0 Hz: {at_rest}"
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.estimate import physics
-from calib.estimate.physics import Windows, rotation
+from calib.estimate.physics import Stack, Windows, rotation
 from calib.estimate.record import Record
 from calib.model import Pose, Window
 from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE, sums_of
@@ -72,7 +72,7 @@ WORLDS = {
 def test_it_predicts_the_slopes_and_means_of_samples(world: str) -> None:
     moved, V = WORLDS[world]
     own = record(V)
-    windows = Windows([own], 20.0, None, 0.0, 0.0, 0.0)
+    windows = Windows(Stack.of([own], fixed=False), 20.0, at_hz=0.0, share=0.0, known_size=0.0)
     slopes, means = windows.predicted(inputs(**moved)[None])
     unit = np.linalg.norm(own.root, axis=1).max()
     # (omega lag)^3 / 6 at 4 Hz and 2 ms is 2e-5 for each of three tones, which no term of the equations has.
@@ -82,7 +82,7 @@ def test_it_predicts_the_slopes_and_means_of_samples(world: str) -> None:
 
 def test_the_derivatives_are_those_of_the_prediction() -> None:
     own = record(WORLDS["as stated"][1])
-    windows = Windows([own], 20.0, None, 2.0, 0.3, 0.01)
+    windows = Windows(Stack.of([own], fixed=False), 20.0, at_hz=2.0, share=0.3, known_size=0.01)
     random, live = np.random.default_rng(2), np.arange(physics.SIZE)
     scale = np.where(np.arange(physics.SIZE) < 9, 0.1, 1e-2)
     scale[physics.LAG], scale[physics.RESPONSE] = 1e-3, 1e-5
@@ -104,7 +104,7 @@ def test_the_derivatives_are_those_of_the_prediction() -> None:
 def test_a_turn_is_perturbed_from_the_left(where: slice) -> None:
     """So a common turn of all positions stays exactly a turn of S, however far each position is turned."""
     own = record(WORLDS["as stated"][1])
-    windows = Windows([own], 20.0, None, 0.0, 0.0, 0.0)
+    windows = Windows(Stack.of([own], fixed=False), 20.0, at_hz=0.0, share=0.0, known_size=0.0)
     p = inputs(TURN=0.3 * TURN, TURN_GRAVITY=4.0 * TURN)
     slope, mean, d_slope, d_mean = windows.linear(p[None], p[None], np.arange(where.start, where.stop))
     for axis in range(3):
