@@ -44,6 +44,12 @@ class Pose:
     along: Array | None = None
     along_rate_s: Array | None = None
 
+    @property
+    def setting(self) -> tuple[object, ...]:
+        """Poses with the same setting have the same nuisances, with the same effects."""
+        angles = self.theta_rad, self.alpha_rad, self.u_theta_rad, self.u_alpha_rad
+        return (self.position, self.direction.tobytes(), self.gravity_mps2.tobytes(), *angles)
+
 
 class Slices(Protocol):
     """Rows that can be read from one number to another: an array, or rows on disk."""

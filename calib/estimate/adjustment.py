@@ -20,7 +20,7 @@ from calib.estimate.determined import determined
 from calib.estimate.equations import Equations
 from calib.estimate.gauss_newton import Flags, Solution, slope_residuals, solve
 from calib.estimate.never_turned import mean_input, never_turned
-from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare, share_after
 from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
@@ -242,19 +242,7 @@ def _solution(
     held: Sequence[Pose], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter, ways: Array
 ) -> Solution:
     """`held`: the pose of each window; `ways` (3, k): the directions that the windows excite."""
-    poses: list[Pose] = []
-    index: dict[tuple[str, bytes], int] = {}
-    pose_of = []
-    for pose in held:
-        seen = [pose.direction, pose.gravity_mps2, pose.along, pose.along_rate_s]
-        key = (pose.position, b"".join(b"-" if part is None else part.tobytes() for part in seen))
-        if key not in index:
-            index[key] = len(poses)
-            poses.append(pose)
-        pose_of.append(index[key])
-    nuisances = Nuisances(poses, data.channels, priors, applied)
-    scale = priors.output_per_mps2
-    return solve(Equations(data, nuisances, pose_of, priors.offset_mps2, scatter, scale, ways), priors)
+    return solve(Equations(data, held, priors, applied, scatter, ways), priors)
 
 
 def _prior_u(priors: Priors, scale: float) -> Array:

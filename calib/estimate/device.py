@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.estimate.link import GRAVITY_NAME, WIDE, WIDE_OFFSET_MPS2
-from calib.estimate.nuisances import rotations
+from calib.estimate.physics import rotation as rotation_of
 from calib.model import Array
 
 FIXED = 1e-14  # part of a covariance's largest eigenvalue: below, a direction has no uncertainty
@@ -82,7 +82,7 @@ def beside(
     (S, Q), (S_r, Q_r), (S_0, Q_0) = ((p[:9].reshape(3, 3), p[9:]) for p in (sensor, reference, stated))
     inverse = np.linalg.inv(S_0)
     true = np.linalg.inv(inverse @ S_r)  # (1 + E)^-1
-    turned = rotations(turn[None])[0] @ rotation
+    turned = rotation_of(turn) @ rotation
     seen, offset = turned @ true @ rotation.T, inverse @ (Q_r - Q_0)
     S_l, at = S @ seen, rotation @ offset
     by_sensor, by_reference, by_turn = np.eye(12), np.zeros((12, 12)), np.zeros((12, 3))

@@ -1,33 +1,27 @@
 """The window equations of the adjustment: the predicted slopes and means, and their derivatives by every unknown.
 
-They follow from V = S a + Q (Eq. 8). For output axis i, with D and G of the pose (calib.estimate.nuisances) and the row
-S_i of S,
-
-    slope on u      S_i D (1 - lag_i^2 omega^2 / 2)
-    slope on du/dt  -S_i D lag_i + S_i D' / omega
-    mean of V       S_i (D mean(u) + G) + Q_i + S_i (D' / omega - lag_i D) mean(du/dt) + offset of the position
-
-Where the response over frequency is an unknown, what is left of it adds to the slopes of each window
-(calib.estimate.banded), and S is replaced by the sensitivity at 0 Hz.
-
-The term in omega^2 = <du^2> / <u^2> is the projection of d2u/dt2 on u. It is exact for a sine, and for any motion after
-the front end has removed the lag that was found, because the remaining lag is then negligible.
+They follow from V = S a + Q (Eq. 8) as calib.estimate.physics has it. Its term in omega^2 = <du^2> / <u^2> is the
+projection of d2u/dt2 on u. It is exact for a sine, and for any motion after the front end has removed the lag that was
+found, because the remaining lag is then negligible.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.estimate.banded import Banded
+from calib.estimate import physics
 from calib.estimate.condense import Condensed
 from calib.estimate.never_turned import never_turned
-from calib.estimate.nuisances import Inputs, Nuisances
+from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.physics import Windows
+from calib.estimate.record import TERMS
 from calib.estimate.slope_scatter import SlopeScatter
-from calib.model import Array
+from calib.model import Array, Pose
 
 # Least singular value of an excited direction, relative to the largest (columns scaled to one). It is 3e-6 for clamp
 # positions of 0, 1 and 2 deg; rounding errors alone give 1e-15.
@@ -61,45 +55,69 @@ class Rows:
 
 
 class Equations:
-    """The window equations of W condensed windows, with their poses and weights, as functions for Gauss-Newton."""
+    """The window equations of W condensed windows, with their poses and weights, as functions for Gauss-Newton.
+
+    `output_per_mps2` is the sensor's scale in output unit per m/s2, as stated or from the data. `known` (W,): gravity
+    is known in the pose of the window; else its mean has no information and gets no weight.
+    """
 
     def __init__(
         self,
         data: Condensed,
-        nuisances: Nuisances,
-        pose_of: list[int],
-        offset_scatter_mps2: float,
+        held: Sequence[Pose],
+        priors: Priors,
+        applied: Applied,
         scatter: SlopeScatter,
-        output_per_mps2: float | None = None,
         ways: Array | None = None,
     ) -> None:
-        """`pose_of` (W,) is the number of each window's pose in `nuisances`. `offset_scatter_mps2` is the SD of the
-        offset between windows, `scatter` that of the slopes. `output_per_mps2` is the sensor's scale in output unit per
-        m/s2; None takes it from the data. `ways` (3, k), orthonormal: the directions that the windows excite; None:
-        all. A nuisance turns the motion out of them, but what the slopes then show of S in other directions is of
-        second order, and mostly noise: the slopes tell nothing of it.
+        """`held` are the poses of the windows, `scatter` that of the slopes. `ways` (3, k), orthonormal: the directions
+        that the windows excite; None: all. A nuisance turns the motion out of them, but what the slopes then show of S
+        in other directions is of second order, and mostly noise: the slopes tell nothing of it.
         """
-        self.data, self.nuisances, self.scatter = data, nuisances, scatter
-        self.pose_of_window = np.array(pose_of)
+        self.data, self.scatter = data, scatter
+        settings = [p.setting for p in held]
+        poses = list(dict.fromkeys(settings))
+        self.nuisances = Nuisances([held[settings.index(s)] for s in poses], data.channels, priors, applied)
+        self._pose_of = np.array([poses.index(s) for s in settings])
         self._excited = None if ways is None or ways.shape[1] == len(ways) else ways @ ways.T
-        self.known = known = nuisances.known[self.pose_of_window]
-        self.output_per_mps2 = self._output_per_mps2() if output_per_mps2 is None else output_per_mps2
+        self._stack = _stack(data, held, self.nuisances.applied_response, self._excited)
+        self.known = np.array([np.isfinite(p.gravity_mps2).all() for p in held])
+        self.output_per_mps2 = priors.output_per_mps2 or self._output_per_mps2()
+        self._windows = Windows(
+            self._stack, nominal=self.likely, at_hz=priors.reference_frequency_hz, share=priors.reference_share,
+            known_size=priors.known_size,
+        )  # fmt: skip
+        self._effect = self.nuisances.effect.copy()
+        self._effect[:, physics.Q] *= self.output_per_mps2
         noise2 = data.type_a.noise**2 / data.count[:, None]
-        variance = noise2 + (offset_scatter_mps2 * self.output_per_mps2) ** 2
-        # If gravity is not known in a pose, the mean has no information and gets no weight.
-        self.mean_weight = np.where(known[:, None], 1.0 / np.sqrt(variance), 0.0)
-        self.white_share = np.where(known[:, None], noise2 / variance, 0.0)
+        variance = noise2 + (priors.offset_mps2 * self.output_per_mps2) ** 2
+        self.mean_weight = np.where(self.known[:, None], 1.0 / np.sqrt(variance), 0.0)
+        self.white_share = np.where(self.known[:, None], noise2 / variance, 0.0)
+
+    @property
+    def gravity_mps2(self) -> Array:
+        """(W, 3) gravity in the pose of each window, 0 where it is not known."""
+        return self._windows.gravity
+
+    @cached_property
+    def _moved(self) -> Array:
+        """(W, M, 3) derivatives of the slopes on u by a row of S, with angles as stated."""
+        m = self.data.channels
+        return np.asarray(self.data.root[:, :m, :m] @ (self._stack.direction @ self._stack.along).mT)
+
+    @cached_property
+    def _held(self) -> Array:
+        """(W, 3) mean input acceleration of each window, with angles as stated."""
+        mean = self.data.mean_x[:, : self.data.channels, None]
+        return np.asarray((self._stack.direction @ mean)[..., 0] + np.nan_to_num(self._stack.gravity_mps2))
 
     @cached_property
     def unseen(self) -> Array:
         """Directions (k, 4) of (a_x, a_y, a_z, 1) normal to every input vector, with angles as stated. The rank is
         4 - k."""
-        data, nuisances, m = self.data, self.nuisances, self.data.channels
-        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], nuisances.direction[self.pose_of_window])
+        moved, held, count = self._moved, self._held[self.known], self.data.count[self.known]
         if self._excited is not None:
             moved = moved @ self._excited
-        held = np.einsum("wkm,wm->wk", nuisances.mean_direction[self.pose_of_window], data.mean_x[:, :m])
-        held, count = (held + nuisances.gravity[self.pose_of_window])[self.known], data.count[self.known]
         if self._excited is not None and never_turned(held):  # what an AC-coupled reference shows in the mean is noise
             held, count = count[None] @ held / count.sum(), count.sum(keepdims=True)
         held = np.sqrt(count)[:, None] * np.pad(held, ((0, 0), (0, 1)), constant_values=1.0)
@@ -136,13 +154,10 @@ class Equations:
         """S (3, 3) along directions that are not excited, as a sensor has it whose axes are at right angles, alike and
         near the stated ones; zeros where all are excited. Only if S is not zero there, an angle that is uncertain shows
         in u of the rest."""
-        data, m = self.data, self.data.channels
         if self._excited is None:
             return np.zeros((3, 3))
-        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_window])
-        told, *_ = np.linalg.lstsq(
-            (moved @ self._excited).reshape(-1, 3), data.slopes[:, :m].reshape(-1, 3), rcond=RANK_TOLERANCE
-        )
+        slopes = self.data.slopes[:, : self.data.channels].reshape(-1, 3)
+        told, *_ = np.linalg.lstsq((self._moved @ self._excited).reshape(-1, 3), slopes, rcond=RANK_TOLERANCE)
         silent = np.eye(3) - self._excited
         outputs, _, ways = np.linalg.svd(told.T @ self._excited / self.output_per_mps2 + silent)
         return np.asarray(self.output_per_mps2 * outputs @ ways @ silent)
@@ -150,29 +165,35 @@ class Equations:
     def _output_per_mps2(self) -> float:
         """The sensor's scale in output unit per m/s2: rms of the outputs over rms of the inputs, slopes and means."""
         data, m = self.data, self.data.channels
-        moved = np.einsum("brc,bkc->brk", data.root[:, :m, :m], self.nuisances.direction[self.pose_of_window])
-        felt = np.einsum("wkm,wm->wk", self.nuisances.mean_direction[self.pose_of_window], data.mean_x[:, :m])
-        gravity, n = (felt + self.nuisances.gravity[self.pose_of_window])[self.known], data.count[self.known]
+        gravity, n = self._held[self.known], data.count[self.known]
         held, level = np.zeros((1, 3)), np.zeros((1, 3))
         if n.size:
             held = np.sqrt(n)[:, None] * (gravity - n @ gravity / n.sum())
             level = np.sqrt(n)[:, None] * (data.mean_v[self.known] - n @ data.mean_v[self.known] / n.sum())
-        inputs = float((moved**2).sum() + (held**2).sum())
+        inputs = float((self._moved**2).sum() + (held**2).sum())
         outputs = float((data.slopes[:, :m] ** 2).sum() + (level**2).sum())
         return float(np.sqrt(outputs / inputs)) if inputs > 0.0 and outputs > 0.0 else 1.0
 
     def at(self, x: Array) -> Rows:
         """Residuals and derivatives at x = [S row by row, Q, nuisances] (N,)."""
-        S, Q, z = x[:9].reshape(3, 3), x[9:12], x[12:]
-        inputs = self.nuisances.at(z)
-        # S is that at the reference frequency; the response is 1 at 0 Hz, where the sensitivity is this times S.
-        steady, by_nuisance = self.nuisances.steady(z)
-        slope, d_slope = self._slopes(steady * S, inputs)
-        mean, d_mean = self._means(steady * S, Q, z, inputs)
-        for moves in (d_slope, d_mean) if by_nuisance.any() else ():
-            moves[..., :9] *= steady
-            moves[..., 12:] += (moves[..., :9] @ x[:9])[..., None] * by_nuisance
-        return Rows(slope, d_slope, mean, d_mean, *self._bands(inputs))
+        data, n, w = self.data, len(x), len(self._pose_of)
+        inputs = (self._effect @ x[12:])[self._pose_of]
+        inputs[:, :12] += x[:12]
+        live = np.union1d(np.arange(12), np.flatnonzero(self._effect.any(axis=(0, 2))))
+        slope, mean, *by_inputs = self._windows.linear(inputs, inputs, live)
+        jacobians = [np.zeros((w, left.shape[1], n)) for left in (slope, mean)]
+        for found, by in zip(jacobians, by_inputs, strict=True):
+            found[..., :12] = by[..., :12]
+            for k, effect in enumerate(self._effect[:, live]):
+                own = self._pose_of == k
+                found[own, :, 12:] = by[own] @ effect
+        noise = np.tile(data.type_a.noise, 2 * data.channels)
+        white = [self.scatter.whiten(part) for part in (slope / noise, jacobians[0] / noise[..., None])]
+        shape, weight = data.slopes.shape, self.mean_weight
+        return Rows(
+            white[0].reshape(shape), white[1].reshape(*shape, n), mean * weight, jacobians[1] * weight[..., None],
+            *self._bands(x[12:]),
+        )  # fmt: skip
 
     def split(self, rows: Array) -> tuple[Array, Array]:
         """Stacked rows (rows, ...) back into slopes (W, 2M, 3, ...) and means (W, 3, ...); those of bands are left."""
@@ -186,91 +207,35 @@ class Equations:
         """Those of the stacked rows (rows, ...) that the bands tell."""
         return rows[self.data.slopes.size + self.data.mean_v.size :]
 
-    def _slopes(self, S: Array, inputs: Inputs) -> tuple[Array, Array]:
-        data, D, ahead = self.data, *(d[self.pose_of_window] for d in (inputs.direction, inputs.rate_direction))
-        omega2 = data.omega2[:, None]
-        on_u = 1.0 - 0.5 * inputs.lag_s**2 * omega2  # (W, 3)
-        on_du = np.broadcast_to(-inputs.lag_s, on_u.shape)
-        ideal = np.einsum("ik,bkm->bim", S, D)
-        per_omega = np.divide(1.0, np.sqrt(omega2), out=np.zeros_like(omega2), where=omega2 > 0.0)
-        across = inputs.quadrature[self.pose_of_window] * per_omega  # (W, 3), felt by the first channel's du/dt
-        on_rate = ideal * on_du[..., None] + np.einsum("ik,bkm->bim", S, ahead)
-        on_rate[:, :, :1] += (across @ S.T)[..., None]
-        slopes = np.concatenate([ideal * on_u[..., None], on_rate], axis=2)  # (W, 3, 2M)
-        if data.bands is not None:
-            passed, d_passed = self._passed(data.bands, inputs)
-            slopes += np.einsum("bim,brm->bir", ideal, passed)
-        residual = data.slopes - np.einsum("brc,bic->bri", data.root, slopes)
-
-        nuisances = self.nuisances
-        d_ideal = np.einsum("ik,jbkm->bimj", S, inputs.d_direction[:, self.pose_of_window])
-        d_on_u = -inputs.lag_s[:, None] * omega2[..., None] * nuisances.lag.T
-        d_on_du = np.broadcast_to(-nuisances.lag.T, d_on_u.shape)
-        d_on_rate = d_ideal * on_du[..., None, None] + ideal[..., None] * d_on_du[:, :, None, :]
-        d_on_rate += np.einsum("ik,jbkm->bimj", S, inputs.d_rate_direction[:, self.pose_of_window])
-        d_across = inputs.d_quadrature[:, self.pose_of_window] * per_omega
-        d_on_rate[:, :, :1] += np.einsum("ik,jbk->bij", S, d_across)[:, :, None]
-        d_z = np.concatenate(
-            [d_ideal * on_u[..., None, None] + ideal[..., None] * d_on_u[:, :, None, :], d_on_rate], axis=2
-        )
-        if data.bands is not None:
-            d_z += np.einsum("bimj,brm->birj", d_ideal, passed) + np.einsum("bim,jbrm->birj", ideal, d_passed)
-        n = 12 + len(nuisances)
-        jacobian = np.zeros((*data.slopes.shape, n))  # (W, 2M, 3, N)
-        per_row = np.concatenate([D[:, None] * on_u[..., None, None], D[:, None] * on_du[..., None, None]], axis=3)
-        if data.bands is not None:
-            per_row += np.einsum("bkm,brm->bkr", D, passed)[:, None]
-        per_row[:, :, :, D.shape[2] :] += ahead[:, None]
-        per_row[:, :, :, D.shape[2] : D.shape[2] + 1] += across[:, None, :, None]
-        if self._excited is not None:
-            per_row = self._excited @ per_row
-        for i in range(3):
-            jacobian[:, :, i, 3 * i : 3 * i + 3] = np.einsum("brc,bkc->brk", data.root, per_row[:, i])
-        jacobian[..., 12:] = np.einsum("brc,bicj->brij", data.root, d_z)
-        noise = data.type_a.noise[:, None]
-        return self._whitened(residual / noise), self._whitened(jacobian / noise[..., None])
-
-    def _passed(self, bands: Banded, inputs: Inputs) -> tuple[Array, Array]:
-        """What the response that is left adds to the slopes, (W, 2M, M), and its derivatives (J, W, 2M, M)."""
-        terms = np.vstack([inputs.response, self.nuisances.response])
-        passed = np.einsum("jk,bkrm->jbrm", terms, bands.projected)
-        return passed[0], passed[1:]
-
-    def _bands(self, inputs: Inputs) -> tuple[Array, Array]:
-        """Residuals (R,) of what the bands tell of the response alone, and their derivatives (R, N)."""
-        bands, n = self.data.bands, 12 + len(self.nuisances)
+    def _bands(self, z: Array) -> tuple[Array, Array]:
+        """Residuals (R,) of what the bands tell of the response alone, and their derivatives (R, N), at values `z` (J,)
+        of the nuisances."""
+        bands, n = self.data.bands, 12 + len(z)
         if bands is None:
             return np.zeros(0), np.zeros((0, n))
         jacobian = np.zeros((len(bands.residual), n))
         jacobian[:, 12:] = bands.moves @ self.nuisances.response.T
-        return bands.residual - bands.moves @ inputs.response, jacobian
+        return bands.residual - bands.moves @ (z @ self.nuisances.response), jacobian
 
-    def _whitened(self, slopes: Array) -> Array:
-        """Rows (W, 2M, 3, ...) weighted for the scatter between windows as well."""
-        flat = slopes.reshape(len(slopes), -1, *slopes.shape[3:])
-        return self.scatter.whiten(flat).reshape(slopes.shape)
 
-    def _means(self, S: Array, Q: Array, z: Array, inputs: Inputs) -> tuple[Array, Array]:
-        data, nuisances, m = self.data, self.nuisances, self.data.channels
-        D = inputs.mean_direction[self.pose_of_window]
-        moved = np.einsum("wkm,wm->wk", D, data.mean_x[:, :m])
-        rate = np.einsum("wkm,wm->wk", D, data.mean_x[:, m:])
-        G = inputs.gravity[self.pose_of_window]
-        # If a window is no whole number of cycles, the mean of du/dt is not 0, and lag and quadrature add to the mean.
-        per_omega = np.divide(1.0, np.sqrt(data.omega2), out=np.zeros_like(data.count), where=data.omega2 > 0.0)
-        share = (data.mean_x[:, m] if m else 0.0 * data.count) * per_omega
-        across = inputs.quadrature[self.pose_of_window] * share[:, None]
-        felt = (moved + across + G)[:, None] - inputs.lag_s[:, None] * rate[:, None]  # (W, 3, 3): axis, direction
-        predicted = np.einsum("ik,wik->wi", S, felt) + Q
-        predicted += self.output_per_mps2 * np.einsum("j,jwi->wi", z, nuisances.offset[:, self.pose_of_window])
-        jacobian = np.zeros((*data.mean_v.shape, 12 + len(nuisances)))
-        for i in range(3):
-            jacobian[:, i, 3 * i : 3 * i + 3] = felt[:, i]
-            jacobian[:, i, 9 + i] = 1.0
-        d_input = np.einsum("jwkm,wm->jwk", inputs.d_mean_direction[:, self.pose_of_window], data.mean_x[:, :m])
-        d_input = d_input + inputs.d_gravity[:, self.pose_of_window]
-        d_input = d_input + inputs.d_quadrature[:, self.pose_of_window] * share[:, None]
-        jacobian[..., 12:] = np.einsum("ik,jwk->wij", S, d_input)
-        jacobian[..., 12:] += self.output_per_mps2 * nuisances.offset[:, self.pose_of_window].transpose(1, 2, 0)
-        jacobian[..., 12:] -= np.einsum("wi,ij->wij", rate @ S.T, nuisances.lag.T)
-        return (data.mean_v - predicted) * self.mean_weight, jacobian * self.mean_weight[..., None]
+def _stack(data: Condensed, held: Sequence[Pose], response: Array, excited: Array | None) -> physics.Stack:
+    """What the physics needs of condensed windows in these poses; `response` (K,) was taken out of all of them."""
+    w, m = len(held), data.channels
+    along, along_rate = np.tile(np.eye(m), (w, 1, 1)), np.zeros((w, m, m))
+    for k, pose in enumerate(held):
+        own = pose.direction.shape[1]
+        if pose.along is not None:
+            along[k, :own, :own] = pose.along
+        if pose.along_rate_s is not None:
+            along_rate[k, :own, :own] = pose.along_rate_s
+    passed = np.zeros((w, TERMS, 2 * m, m))
+    if data.bands is not None:
+        passed[:, : data.bands.projected.shape[1]] = data.root[:, None] @ data.bands.projected
+    return physics.Stack(
+        direction=np.array([physics.padded(pose.direction, m) for pose in held]),
+        gravity_mps2=np.array([pose.gravity_mps2 for pose in held]), along=along, along_rate_s=along_rate,
+        excited=np.tile(np.eye(3) if excited is None else excited, (w, 1, 1)), root=data.root, slopes=data.slopes,
+        passed=passed, omega2=data.omega2, noise=data.type_a.noise, mean_x=data.mean_x, means=data.mean_v[:, None],
+        over_t=np.tile(np.eye(1, 3), (w, 1, 1)), temperature_degc=np.full(w, np.nan), held_mps2=np.full((w, 3), np.nan),
+        response=np.tile(np.pad(response, (0, TERMS - len(response))), (w, 1)),
+    )  # fmt: skip

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib.estimate.adjustment import Adjustment
 from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.physics import STEP
 from calib.estimate.quantities import REFERENCE, REFERENCE_DRIFT, S_AND_Q, Quantity
 from calib.excitation.sums import pool
 from calib.model import Array, Pose, Window
@@ -176,7 +177,6 @@ class Plan:
         channels = poses[0].direction.shape[1]
         given = Priors({**priors.values, "reference": 0.0, "reference_drift": 0.0}, known=priors.known)
         nuisances = Nuisances(poses, channels, given, Applied())
-        at = nuisances.at(np.zeros(len(nuisances)))
         mean = np.zeros((len(poses), channels)) if reference_mps2 is None else np.asarray(reference_mps2)
         self._names = [t.key for t in nuisances.terms]
         self._u = nuisances.uncertainty
@@ -187,13 +187,12 @@ class Plan:
         self._offset_u = given.offset_mps2
         # (P, 3, m + 1) inputs per unit motion of each channel, then of the mean; derivatives (J, P, 3, m + 1).
         # The mean is felt with the sensitivity at 0 Hz, the motion with that at its frequency.
-        ratio, d_ratio = nuisances.steady(np.zeros(len(nuisances)))
-        steady = ratio * (at.gravity + np.einsum("pkm,pm->pk", at.mean_direction, mean))
-        d_steady = ratio * (at.d_gravity + np.einsum("jpkm,pm->jpk", at.d_mean_direction, mean))
-        d_steady += d_ratio[:, None, None] * steady
-        self._felt = np.concatenate([at.direction, steady[..., None]], axis=2)
-        self._d_felt = np.concatenate([at.d_direction, d_steady[..., None]], axis=3)
-        self._offset = nuisances.offset
+        z = np.vstack([np.zeros(len(nuisances)), 1j * STEP * np.eye(len(nuisances))])
+        at = nuisances.at(z)
+        steady = nuisances.steady(z)[:, None, None] * (at.gravity + (at.direction @ mean[..., None])[..., 0])
+        felt = np.concatenate([at.direction, steady[..., None]], axis=3)
+        self._felt, self._d_felt = felt[0].real, felt[1:].imag / STEP
+        self._offset = at.offset[1:].imag / STEP
 
     def after(self, joint: Joint, stop: int, expected: Expected) -> Joint:
         """What is known after this stop."""

@@ -1,26 +1,19 @@
 """The nuisances: unknowns other than S and Q (angles, offsets, the reference, gravity, lag), each with a stated prior.
 
-calib.estimate.terms has the effect of each nuisance. For P poses and M reference channels the input acceleration in the
-sensor's frame is
-
-    a(t) = D u(t - lag) + D' u'(t) / omega + G
-    D = R(turn) (D0 + t L) / (1 + r)        D' = R(turn) q L        G = R(turn') G0 (1 + dg / |G0|)
-
-D0, G0 are the stated direction and gravity (Eqs. 9-11 on the clamp), R rotations, r the relative error of the
-reference, dg the error of gravity. t and q are relative motion along L, transverse to a uniaxial reference, which does
-not measure it: t in phase with the motion, q 90 deg ahead of it. A table that rocks causes both.
+calib.estimate.terms has the effect of each nuisance on the inputs of a window, calib.estimate.physics what these do.
+Stated directions and gravity are those of Eqs. 9-11 on the clamp. Transverse motion that a uniaxial reference does not
+measure is in phase with the motion or 90 deg ahead of it; a table that rocks causes both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib.estimate import physics
 from calib.estimate.deviations import ByAxis, LeftOpen
 from calib.estimate.quantities import (
     LAG,
@@ -33,7 +26,7 @@ from calib.estimate.quantities import (
     Statement,
 )
 from calib.estimate.terms import terms
-from calib.model import Array, Pose, own_channels, scale_of
+from calib.model import Array, Pose, scale_of
 from calib.signal.known_response import UNKNOWN, KnownResponse
 from calib.signal.response import ALL_POWERS, FLAT, POWERS, Response, by_term
 
@@ -182,163 +175,67 @@ class Applied:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """The inputs at given values of the J nuisances, and their derivatives with respect to each nuisance.
-
-    `direction` (P, 3, M) applies to the motion, `mean_direction` (P, 3, M) to the means of the reference. They differ
-    for silent channels, which have no motion of their own, but whose means act on the sensor. `rate_direction`
-    (P, 3, M) in s applies to the motion's derivative: it is the part of the silent channels' motion that is 90 deg
-    ahead. `quadrature` (P, 3) is relative motion 90 deg ahead that the reference does not measure; `gravity` (P, 3) in
-    m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s; `response` (5,) or (9,) in s^k. The
-    derivatives `d_...` have the same shapes with J in front.
-    """
+    """The inputs in P poses at given values of the nuisances: `direction` D (P, 3, M) of the motion; `gravity` G (P, 3)
+    and `offset` (P, 3) in m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s."""
 
     direction: Array
-    mean_direction: Array
-    rate_direction: Array
-    quadrature: Array
     gravity: Array
+    offset: Array
     lag_s: Array
     reference_corner: float
     sensor_corner: float
-    response: Array
-    d_direction: Array
-    d_mean_direction: Array
-    d_rate_direction: Array
-    d_quadrature: Array
-    d_gravity: Array
 
 
 class Nuisances:
-    """The J nuisances of P poses whose uncertainty is not 0, with their effects stacked as arrays (J, ...)."""
+    """The J nuisances of P poses whose uncertainty is not 0: `effect` (P, SIZE, J) of one unit of each on the inputs of
+    a window (calib.estimate.physics), an offset in m/s2; `response` (J, K) on the terms of the response."""
 
     def __init__(
         self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied, reference: str = ""
     ) -> None:
         """`reference` is the identity of the reference; see calib.estimate.terms."""
         self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
-        n = len(poses)
-        self._stated = np.zeros((n, 3, channels))
-        self._along, self._along_rate = np.tile(np.eye(channels), (n, 1, 1)), np.zeros((n, channels, channels))
-        for p, pose in enumerate(poses):
-            m = pose.direction.shape[1]
-            self._stated[p, :, :m] = pose.direction
-            if pose.along is not None:
-                self._along[p, :m, :m] = pose.along
-            if pose.along_rate_s is not None:
-                self._along_rate[p, :m, :m] = pose.along_rate_s
-        self.direction, self.mean_direction = self._stated @ self._along, self._stated
-        stated = np.array([pose.gravity_mps2 for pose in poses])
-        self.known: NDArray[np.bool_] = np.isfinite(stated).all(axis=1)
-        self.gravity = np.where(self.known[:, None], stated, 0.0)  # 0 in a pose whose gravity is not known
-        self._real = own_channels(channels)
-        self._magnitude = np.maximum(np.linalg.norm(self.gravity, axis=1), np.finfo(float).tiny)
-        by_direction, by_gravity = (self._stacked(f"turn_{of}", (n, 3)) for of in ("direction", "gravity"))
-        self._turns = np.stack([by_direction, by_gravity], axis=1)
-        self._cross_direction, self._cross_gravity = _cross(by_direction), _cross(by_gravity)
-        self._transverse = self._stacked("transverse", (n, 3))
-        self._quadrature = self._stacked("quadrature", (n, 3))
-        self._reference = self._stacked("reference", (channels,))
-        self._gravity = self._stacked("gravity", (1,))
-        self.offset = self._stacked("offset", (n, 3))
-        self.lag = self._stacked("lag", (3,))
-        self.reference_corner = self._stacked("reference_corner", (1,))[:, 0]
-        self.sensor_corner = self._stacked("sensor_corner", (1,))[:, 0]
-        self.response = self._stacked("response", (priors.response_powers,))
+        self.direction = np.array([physics.padded(pose.direction, channels) for pose in poses])
+        self.gravity = np.nan_to_num([pose.gravity_mps2 for pose in poses])  # 0 in a pose whose gravity is not known
+        self.effect = np.zeros((len(poses), physics.SIZE, len(self.terms)))
+        for j, term in enumerate(self.terms):
+            self.effect[:, :, j] = term.on_inputs(len(poses))
+        self.response = self.effect[0, physics.RESPONSE, :].T[:, : priors.response_powers]
+        self._corners = [
+            np.array([0.0 if corner is None else corner[0] for corner in own])
+            for own in ([t.reference_corner for t in self.terms], [t.sensor_corner for t in self.terms])
+        ]
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
-        self.reference_frequency_hz = priors.reference_frequency_hz
+        self.reference_frequency_hz, self._known_size = priors.reference_frequency_hz, priors.known_size
         at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
         self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_powers)[0].real
-        self._applied_response = self._applied() @ self.response
-        self._known_size = priors.known_size
-        self._corner_hz = (self.reference_corner - self.sensor_corner) / (2.0 * np.pi)
+        self.applied_response = np.array([t.applied for t in self.terms]) @ self.response
 
     def __len__(self) -> int:
         return len(self.terms)
-
-    def with_applied(self, applied: Applied) -> Nuisances:
-        """The same nuisances with other values removed from the data: much sooner made than anew."""
-        other = copy(self)
-        other.terms = [t.with_applied(applied.by_kind) for t in self.terms]
-        other._applied_response = other._applied() @ other.response
-        return other
-
-    def _applied(self) -> Array:
-        return np.array([t.applied for t in self.terms])
 
     @property
     def uncertainty(self) -> Array:
         """(J,) prior standard uncertainties."""
         return np.array([t.uncertainty for t in self.terms])
 
-    def _stacked(self, name: str, shape: tuple[int, ...]) -> Array:
-        maps = [getattr(t, name) for t in self.terms]
-        return np.array([np.zeros(shape) if m is None else m for m in maps]).reshape(len(self.terms), *shape)
-
-    def steady(self, z: Array) -> tuple[float, Array]:
-        """The sensitivity at 0 Hz over that at the reference frequency, and the derivatives (J,) of its logarithm."""
-        away = self._at_reference @ (self._applied_response + z @ self.response) + self._known_size
-        return float(np.exp(-away)), -(self.response @ self._at_reference)
+    def steady(self, z: Array) -> Array:
+        """(...,) the sensitivity at 0 Hz over that at the reference frequency at the values `z` (..., J)."""
+        return np.asarray(
+            np.exp(-((self.applied_response + z @ self.response) @ self._at_reference + self._known_size))
+        )
 
     def by_axis(self, z: Array, left_open: LeftOpen) -> ByAxis:
         """The effect of axes that do not respond quite alike, at the values `z` (J,) of the nuisances."""
-        terms, powers = self._applied_response + z @ self.response, ALL_POWERS[: len(self._at_reference)]
+        terms, powers = self.applied_response + z @ self.response, ALL_POWERS[: len(self._at_reference)]
         return left_open.by_axis(terms, self._at_reference, powers)
 
     def at(self, z: Array) -> Inputs:
-        """The inputs when the nuisances have the values `z` (J,)."""
-        turn, gravity_turn = rotations(np.einsum("j,jgpk->gpk", z, self._turns))
-        scale = 1.0 + np.einsum("j,jm->m", z, self._reference)
-        sideways = self._stated.copy()
-        if sideways.shape[2]:
-            sideways[:, :, 0] += np.einsum("j,jpk->pk", z, self._transverse)
-        real = self._real
-        felt = turn @ sideways[:, :, :real]
-        # A corner of c Hz removed c times the integral; the integrals are channels of their own (calib.signal.corner).
-        direction = np.concatenate([felt, float(z @ self._corner_hz) * felt], axis=2)[:, :, : sideways.shape[2]] / scale
-        d_direction = self._cross_direction @ direction
-        d_direction -= direction * (self._reference / scale)[:, None, None, :]
-        if real:
-            d_direction[..., 0] += np.einsum("pik,jpk->jpi", turn, self._transverse) / scale[0]
-            d_direction[..., real:] += (
-                self._corner_hz[:, None, None, None] * (felt / scale[:real])[..., : sideways.shape[2] - real]
-            )
-        # The product of turn and quadrature is neglected: at most 1 % of 0.2 deg.
-        d_quadrature = np.einsum("pik,jpk->jpi", turn, self._quadrature)
-        stretch = 1.0 + np.einsum("j,jo->o", z, self._gravity) / self._magnitude
-        unstretched = np.einsum("pik,pk->pi", gravity_turn, self.gravity)
-        gravity = unstretched * stretch[:, None]
-        d_gravity = (self._cross_gravity @ gravity[..., None])[..., 0] + self._gravity[:, :, None] * (
-            unstretched / self._magnitude[:, None]
-        )
+        """The inputs when the nuisances have the values `z` (J,), or (..., J): then all have these dimensions in
+        front."""
+        p = (self.effect @ z[..., None, :, None])[..., 0]
+        reference, sensor = (z @ corner for corner in self._corners)
         return Inputs(
-            direction @ self._along,
-            direction,
-            direction @ self._along_rate,
-            np.einsum("jpk,j->pk", d_quadrature, z),
-            gravity,
-            z @ self.lag,
-            float(z @ self.reference_corner),
-            float(z @ self.sensor_corner),
-            z @ self.response,
-            d_direction @ self._along,
-            d_direction,
-            d_direction @ self._along_rate,
-            d_quadrature,
-            d_gravity,
-        )
-
-
-def rotations(vectors: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad, by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    cross = _cross(vectors)
-    linear, square = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + linear * cross + square * (cross @ cross))
-
-
-def _cross(vectors: Array) -> Array:
-    """Matrices (..., 3, 3) that give the vector product of `vectors` (..., 3) with another vector."""
-    cross = np.zeros((*vectors.shape, 3))
-    cross[..., [2, 0, 1], [1, 2, 0]] = vectors
-    cross[..., [1, 2, 0], [2, 0, 1]] = -vectors
-    return cross
+            physics.felt_motion(p, self.direction), physics.felt_gravity(p, self.gravity), p[..., physics.Q],
+            p[..., 0, physics.LAG], reference, sensor,
+        )  # fmt: skip

@@ -25,14 +25,12 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.estimate.record import TERMS, Record
 from calib.estimate.type_a import Index
 from calib.model import Array, own_channels
 from calib.signal.response import by_term
 
-Flags = NDArray[np.bool_]
 STEP = 1e-30  # of the complex step: its square is lost beside 1, so that the derivative is exact
 AT_ONCE = 20_000  # windows times inputs whose derivatives are found together: some 50 MB
 _PARTS = {
@@ -114,11 +112,10 @@ class Windows:
         self.stack, self.channels = stack, stack.along.shape[1]
         self.silent = np.zeros((3, 3)) if nominal is None else nominal @ (np.eye(3) - stack.excited)
         self.away = None if held_mps2 is None else np.nan_to_num(stack.held_mps2 - held_mps2)
-        self.known: Flags = np.isfinite(stack.gravity_mps2).all(
-            axis=1
-        )  # else the means tell nothing, and get no weight
+        # Where nobody stated gravity the means tell nothing, and get no weight.
+        self.known = np.array(np.isfinite(stack.gravity_mps2).all(axis=1), dtype=bool)
         self.gravity = np.where(self.known[:, None], stack.gravity_mps2, 0.0)
-        self.told_degc: Flags = np.isfinite(stack.temperature_degc[:, None]).all(axis=1)
+        self.told_degc = np.array(np.isfinite(stack.temperature_degc), dtype=bool)
         self.over_zero = np.where(self.told_degc, stack.temperature_degc - zero_degc, 0.0)
         self.over_t = _about(stack.over_t, np.where(self.told_degc, zero_degc, 0.0))
         omega = np.sqrt(stack.omega2)

@@ -155,9 +155,7 @@ class Record:
     @cached_property
     def setting(self) -> tuple[object, ...]:
         """Records with the same setting have the same unknowns, with the same effects."""
-        p = self.pose
-        angles = p.theta_rad, p.alpha_rad, p.u_theta_rad, p.u_alpha_rad
-        return (p.position, p.direction.tobytes(), p.gravity_mps2.tobytes(), *angles, self.reference, self.channels)
+        return (*self.pose.setting, self.reference, self.channels)
 
     @cached_property
     def loadings(self) -> Array:

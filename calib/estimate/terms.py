@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.estimate import physics
 from calib.estimate import quantities as kinds
 from calib.estimate.quantities import Kind, Quantity, Stated
 from calib.model import Array, Pose, own_channels
@@ -68,6 +69,23 @@ class Term:
             return replace(self, applied=float(values[0]))
         k = int(np.flatnonzero(self.response)[0])
         return replace(self, applied=float(values[k] / self.response[k]) if k < len(values) else 0.0)
+
+    def on_inputs(self, poses: int) -> Array:
+        """(P, SIZE) the effect of one unit on the inputs of a window (calib.estimate.physics) in each of P poses; an
+        offset in m/s2."""
+        found = np.zeros((poses, physics.SIZE))
+        for where, what in (
+            (physics.TURN, self.turn_direction), (physics.TURN_GRAVITY, self.turn_gravity),
+            (physics.ACROSS, self.transverse), (physics.AHEAD, self.quadrature), (physics.LAG, self.lag),
+            (physics.GRAVITY, self.gravity), (physics.RESPONSE, self.response), (physics.Q, self.offset),
+            (physics.REFERENCE, None if self.reference is None else self.reference[:3]),
+        ):  # fmt: skip
+            if what is not None:
+                found[:, where.start : where.start + what.shape[-1]] += what
+        for sign, corner in ((1.0, self.reference_corner), (-1.0, self.sensor_corner)):
+            if corner is not None:
+                found[:, physics.CORNER] += sign * corner[0] / (2.0 * np.pi)
+        return found
 
     @property
     def name(self) -> str:

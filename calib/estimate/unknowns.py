@@ -278,7 +278,8 @@ class Unknowns:
         found[physics.STRETCH] += self._named(MAIN_TEMPERATURE)
         found[physics.OVER_T] += np.vstack([self._named(offset_temperature(power)) for power in (1, 2)])
         for t in self._terms[record.setting]:
-            own = self._of_one(t)
+            (own,) = t.on_inputs(1)
+            own[physics.Q] *= self.statements.scale
             found[:, self.at[t.key]] += own
             if t.kind.since_certificate:
                 found[:, self.at[replace(t.quantity, centre=True).key]] += own
@@ -290,22 +291,4 @@ class Unknowns:
         for row, name in enumerate(names):
             if name in self.at:
                 found[row, self.at[name]] = 1.0
-        return found
-
-    def _of_one(self, t: Term) -> Array:
-        """(SIZE,) the effect of one unit of a nuisance."""
-        found = np.zeros(physics.SIZE)
-        for where, what in (
-            (physics.TURN, t.turn_direction), (physics.TURN_GRAVITY, t.turn_gravity), (physics.ACROSS, t.transverse),
-            (physics.AHEAD, t.quadrature), (physics.LAG, t.lag), (physics.GRAVITY, t.gravity),
-            (physics.REFERENCE, None if t.reference is None else t.reference[:3]), (physics.RESPONSE, t.response),
-        ):  # fmt: skip
-            if what is not None:
-                own = np.ravel(what)
-                found[where.start : where.start + len(own)] += own
-        if t.offset is not None:
-            found[physics.Q] += self.statements.scale * t.offset[0]
-        for sign, corner in ((1.0, t.reference_corner), (-1.0, t.sensor_corner)):
-            if corner is not None:
-                found[physics.CORNER] += sign * corner[0] / (2.0 * np.pi)
         return found

@@ -87,7 +87,7 @@ def _short_reasons(windows: Sequence[Window]) -> list[str]:
 def _rank_reasons(windows: Sequence[Window], solution: Solution) -> list[str]:
     found, full = solution.equations.rank, 4
     clamped = all(w.pose.theta_rad is not None for w in windows)
-    static = bool(solution.equations.known.any() and np.any(solution.equations.nuisances.gravity))
+    static = bool(solution.equations.known.any() and np.any(solution.equations.gravity_mps2))
     if clamped and static and found < full:
         angles = len({(w.pose.theta_rad, w.pose.alpha_rad) for w in windows})
         return [
@@ -297,7 +297,7 @@ def misfit(solution: Solution) -> float:
     weight = np.where(equations.mean_weight > 0.0, equations.mean_weight, np.inf)
     root = np.sqrt(data.count)[:, None]
     held = equations.known
-    if np.ptp(equations.nuisances.gravity[equations.pose_of_window], axis=0).any():
+    if np.ptp(equations.gravity_mps2, axis=0).any():
         centred = data.mean_v - data.count @ data.mean_v / data.count.sum()
         parts.append(((mean / weight * root)[held], (centred * root)[held], noise[held]))
     shares = [0.0]

@@ -255,7 +255,7 @@ def _response(S: Array, found: Sequence[Ratios], readings: Sequence[Reading]) ->
     _, pose_of = _positions(found)
     omega = 2 * np.pi * float(np.mean([r.frequency_hz for r in found]))
 
-    def response(inputs: Inputs, _: Array) -> Array:
+    def response(inputs: Inputs) -> Array:
         passed = np.hypot(1.0, inputs.reference_corner / omega) / np.hypot(1.0, inputs.sensor_corner / omega)
         total, count = np.zeros((3, 3)), np.zeros((3, 3))
         for r in readings:

@@ -25,7 +25,7 @@ def statement(fit: Fit, windows: Sequence[Window], priors: Priors) -> Statement:
     used = [w for w in windows if w.used]
     model = _Model(fit, used)
     contributions = propagate(
-        lambda inputs, offset: model.solution(inputs, offset[model.pose_of]),
+        lambda inputs: model.solution(inputs, inputs.offset[model.pose_of]),
         Nuisances(model.poses, used[0].sums.reference_channels, priors, Applied()),
     )
     contributions |= _offsets_between_windows(model, priors.offset_mps2)

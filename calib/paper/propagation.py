@@ -16,8 +16,8 @@ from calib.distributions import coverage_factor
 from calib.estimate.nuisances import Inputs, Nuisances
 from calib.model import Array
 
-Response = Callable[[Inputs, Array], Array]
-"""(inputs, offset (P, 3) in m/s2) -> (12,) as calib.model.PARAMETERS; NaN for parameters the method does not give."""
+Response = Callable[[Inputs], Array]
+"""inputs -> (12,) as calib.model.PARAMETERS; NaN for parameters the method does not give."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,10 +69,10 @@ def propagate(response: Response, nuisances: Nuisances) -> dict[str, Contributio
     The first order is 0 for main sensitivities if an axis is exactly along the motion, as in Method 1.
     """
     none = np.zeros(len(nuisances))
-    before = response(nuisances.at(none), _offset(nuisances, none))
+    before = response(nuisances.at(none))
     found: dict[str, Contribution] = {}
     for term, one in zip(nuisances.terms, np.diag(nuisances.uncertainty), strict=True):
-        up, down = (response(nuisances.at(z), _offset(nuisances, z)) for z in (one, -one))
+        up, down = (response(nuisances.at(z)) for z in (one, -one))
         parts = {term.name: (up - down) / 2, f"{term.name}, second order": np.sqrt(3) / 2 * (up + down - 2 * before)}
         found |= {name: Contribution(term.source, part) for name, part in parts.items() if np.nan_to_num(part).any()}
     return found
@@ -92,7 +92,3 @@ def joint_covariance(statements: Sequence[Statement]) -> Array:
     type_a = np.concatenate([s.u_type_a for s in statements])
     stacked = np.array(changes)
     return np.asarray(np.einsum("si,sj->ij", stacked, stacked) + np.diag(type_a**2))
-
-
-def _offset(nuisances: Nuisances, z: Array) -> Array:
-    return np.asarray(np.einsum("j,jpk->pk", z, nuisances.offset))

@@ -7,7 +7,7 @@ import pytest
 
 from calib.estimate.condense import condense
 from calib.estimate.equations import Equations
-from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.slope_scatter import SlopeScatter
 from calib.excitation.excited import Excitation, excited
 from calib.excitation.sums import window_sums
@@ -100,7 +100,7 @@ def test_a_silent_channel_that_moves_ahead_of_the_others_turns_the_motion_s_deri
     assert abs(found.pose.along_rate_s[0, 1] - ahead_s) < 4 * u_slope / omega.mean()
     assert np.abs(found.pose.along[[0, 2], 1]).max() < 4 * u_slope
     data = condense([found])
-    equations = Equations(data, Nuisances([found.pose], 3, Priors.none(), Applied()), [0], 0.0, SlopeScatter.of(data))
+    equations = Equations(data, [found.pose], Priors.none(), Applied(), SlopeScatter.of(data))
     rows = equations.at(np.append(S.ravel(), np.zeros(3)))
     live = np.diag(data.root[0]) > 0.0
     # Four rows of three outputs at most; without the motion ahead the row of the derivative is 30 SDs off.

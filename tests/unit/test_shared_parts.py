@@ -1,26 +1,11 @@
-"""What is computed once for many windows is the same as computed anew; order statistics are those of numpy."""
+"""Order statistics are those of numpy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from calib.estimate.nuisances import Applied, Nuisances, Priors
-from calib.geometry import beside
 from calib.signal.order_statistics import FEW, distinct, median, quantile
-from calib.signal.response import Response
-
-
-def test_nuisances_with_other_values_removed_are_those_made_anew() -> None:
-    pose, priors = beside(np.eye(3), [0.0, 0.0, 9.8]), Priors(lag_s=0.02).with_response((1.0, 20.0))
-    first = Nuisances([pose], 3, priors, Applied.of(priors, 0.001), "A")
-    applied = Applied.of(priors, 0.002, Response((-1e-5, 2e-8, -3e-10, 4e-12, -5e-14), 20.0))
-    shared, anew = first.with_applied(applied), Nuisances([pose], 3, priors, applied, "A")
-    assert [t.applied for t in shared.terms] == [t.applied for t in anew.terms]
-    assert sum(t.applied != 0.0 for t in shared.terms) == 6
-    z = np.linspace(-1e-3, 1e-3, len(anew))
-    assert shared.steady(z)[0] == anew.steady(z)[0] != first.steady(z)[0]
-    assert [t.applied for t in first.terms].count(0.001) == 1
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 16, 17, FEW, FEW + 1, FEW + 2, 1001])
