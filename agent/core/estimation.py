@@ -14,7 +14,7 @@ from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
 from agent.core.hypotheses import Devices, confirmed, possible_jump, tilt_rad
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
-from calib.estimate.axes import LEAST_S
+from calib.estimate.axes import LEAST_S, where_nothing_moved
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.innovation import Innovation
@@ -191,8 +191,9 @@ class Estimation:
         same = not self._held or any(held_one.reference == record.reference for held_one in self._held)
         enough = trial.windows > 1 or window.stop_s - window.start_s >= LEAST_S
         evidence = Evidence(
-            day * DAY_S, innovation.statistic, innovation.degrees_of_freedom, dismisses=same, enough=enough
-        )
+            day * DAY_S, innovation.statistic, innovation.degrees_of_freedom, dismisses=same, enough=enough,
+            still="" if self.gate.calibrated else where_nothing_moved(trial.unexcited),
+        )  # fmt: skip
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
         if decision.action == "take":
             self.state = trial

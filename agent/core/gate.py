@@ -25,7 +25,8 @@ PROPOSALS_KEPT = 8  # so that an operator can accept an estimate after newer one
 class Evidence:
     """What the gate needs of one window: chi-squared of its innovation, with the covariance of the state, and whether
     its excitation supports an update; if not, `reason` says why. `dismisses`: if it fits, it may dismiss held ones.
-    `enough`: with it the state has seen two windows, or 10 s, which a first calibration needs."""
+    `enough`: with it the state has seen two windows, or 10 s, which a first calibration needs. `still`: a sentence on
+    the directions in which nothing moved so far, "" where there is none."""
 
     t_s: float
     statistic: float
@@ -34,6 +35,7 @@ class Evidence:
     reason: str = ""
     dismisses: bool = True
     enough: bool = True
+    still: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +181,7 @@ class Gate:
         elif self._settling:
             self._settling -= 1
         said = "consistent with the calibration so far"
-        return self._accepted("take", candidate, said, numbers, enough=evidence.enough)
+        return self._accepted("take", candidate, said, numbers, evidence)
 
     def _confirmed(self, confirmed: Calibration, numbers: dict[str, float]) -> Decision:
         change = self._anchor.change(confirmed)
@@ -206,8 +208,7 @@ class Gate:
         calibration: Calibration,
         reason: str,
         numbers: dict[str, float],
-        *,
-        enough: bool = True,
+        evidence: Evidence | None = None,
     ) -> Decision:
         """The state takes the window. Policy and determined parameters decide whether S and Q in force change too."""
         # The data need not determine a parameter that the certificate states well enough.
@@ -218,7 +219,10 @@ class Gate:
             missing = [p for p, told in zip(PARAMETERS, known, strict=True) if not told]
             self._settling = 0  # RECALIBRATING is only for a calibration in force
             numbers |= {"determined": determined, "determined_threshold": least}
-            return self._decision(action, f"not in force yet, parameters not determined: {', '.join(missing)}", numbers)
+            still = "" if evidence is None or not evidence.still else f"; {evidence.still}"
+            lacking = f"parameters not determined: {', '.join(missing)}{still}"
+            return self._decision(action, f"not in force yet, {lacking}", numbers)
+        enough = evidence is None or evidence.enough
         if not self._calibrated and (lacking := _lacking(calibration, known, enough=enough)):
             self._settling = 0
             return self._decision(action, f"not in force yet: {lacking}", numbers)

@@ -183,3 +183,17 @@ def axis_warnings(S: Array) -> list[str]:
 
 def _listed(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def where_nothing_moved(unexcited: Array) -> str:
+    """A sentence on the directions (k, 3) in the sensor's frame that nothing excites; "" where there is no motion, or
+    motion in all directions."""
+    if len(unexcited) == 1:
+        return f"the motion is in a plane, and nothing moves along its normal {_in_axes(unexcited[0])}"
+    if len(unexcited) == 2:
+        return f"all motion is along one direction, {_in_axes(np.cross(*unexcited))}"
+    return ""
+
+
+def _in_axes(direction: Array) -> str:
+    return f"({', '.join(f'{round(part, 3):g}' for part in direction)}) in the sensor's axes x, y, z"

@@ -43,6 +43,7 @@ OF_REFERENCES = [  # what belongs to a place is as it is stated now, whichever r
     for s in kind.statements
     if s.name in PRIORS
 ]
+STILL = 1e-3  # of the windows that move in the direction in which most do: so few are rounding errors, and small turns
 MOVED_U = 0.3  # standard uncertainties: what is not linear within so little is far below u
 Jump = Mapping[str, float]
 
@@ -204,6 +205,13 @@ class State:
     def motion_to_hz(self) -> float:
         """Upper end of the motion that is used; inf before a window told a band that is wide enough for a response."""
         return self._over.to_hz
+
+    @property
+    def unexcited(self) -> Array:
+        """(k, 3) directions in the sensor's frame, orthonormal, in which no window moved."""
+        moved = np.sum([r.excited for r in together(self._records, fixed=self._fixed)], axis=0)
+        size, ways = np.linalg.eigh(moved) if self._records else (np.zeros(3), np.eye(3))
+        return np.asarray(ways.T[size <= STILL * size[-1]])
 
     def _determined(self, mean: Array, covariance: Array) -> Flags:
         return determined(mean, np.sqrt(covariance.diagonal()), self._u, np.ones(12, dtype=bool))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.distributions import chi2_quantile, coverage_factor
-from calib.estimate.axes import LEAST_S, sensitivity_reasons
+from calib.estimate.axes import LEAST_S, sensitivity_reasons, where_nothing_moved
 from calib.estimate.budget import Budget
 from calib.estimate.gauss_newton import Flags, Solution
 from calib.estimate.mistakes import FACTORS, of_a_prior, of_means, with_unit
@@ -112,20 +112,6 @@ def nothing_determined(solution: Solution, determined: Flags) -> list[str]:
         f"rank {equations.rank} of 4: the data determine none of the 12 parameters"
         f"{': ' if where else ''}{where}; measure with more motion or in more positions"
     ]
-
-
-def where_nothing_moved(unexcited: Array) -> str:
-    """A sentence on the directions (k, 3) in the sensor's frame that nothing excites; "" where there is no motion, or
-    motion in all directions."""
-    if len(unexcited) == 1:
-        return f"the motion is in a plane, and nothing moves along its normal {_in_axes(unexcited[0])}"
-    if len(unexcited) == 2:
-        return f"all motion is along one direction, {_in_axes(np.cross(*unexcited))}"
-    return ""
-
-
-def _in_axes(direction: Array) -> str:
-    return f"({', '.join(f'{round(part, 3):g}' for part in direction)}) in the sensor's axes x, y, z"
 
 
 def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import __version__
+from calib.estimate.axes import where_nothing_moved
 from calib.estimate.response_told import BandSensitivity
-from calib.estimate.verdict import where_nothing_moved
 from calib.model import Array, Calibration, Window
 from calib.recorded.output_unit import shown_in
 from calib.rounding import KNOWN_BEFORE, from_to, plus_minus

@@ -49,6 +49,8 @@ def test_too_little_determined_is_collecting() -> None:
     decision = g.judge(consistent(), calibration(determined=11))
     assert (decision.action, decision.in_force, decision.status) == ("take", False, "COLLECTING")
     assert decision.reason == "not in force yet, parameters not determined: Qz"
+    still = replace(consistent(), still="the motion is in a plane")
+    assert g.judge(still, calibration(determined=11)).reason == f"{decision.reason}; the motion is in a plane"
     assert (decision.numbers["determined"], decision.numbers["determined_threshold"]) == (11, 12)
     assert g.judge(consistent(), calibration()).status == "VALID"
     assert g.judge(consistent(), calibration(determined=4)).in_force  # what is in force once stays

@@ -154,3 +154,5 @@ def test_on_line_s_across_the_motion_stays_at_the_prior_through_days_and_a_resta
     across = np.linalg.svd(along[None])[2][1:]
     assert np.abs((far[-1] - far[0]) @ across.T).max() < 0.05 * 0.03
     assert np.abs((far[-1] - S) @ along).max() < 4e-3
+    assert len(found.unexcited) == 2
+    assert np.abs(found.unexcited @ along).max() < 4e-3
