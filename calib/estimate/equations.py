@@ -75,10 +75,10 @@ class Equations:
         in other directions is of second order, and mostly noise: the slopes tell nothing of it.
         """
         self.data, self.scatter = data, scatter
-        settings = [p.setting for p in held]
-        poses = list(dict.fromkeys(settings))
-        self.nuisances = Nuisances([held[settings.index(s)] for s in poses], data.channels, priors, applied)
-        self._pose_of = np.array([poses.index(s) for s in settings])
+        poses = {p.setting: p for p in held}
+        number = {setting: k for k, setting in enumerate(poses)}
+        self._pose_of = np.array([number[p.setting] for p in held])
+        self.nuisances = Nuisances(list(poses.values()), data.channels, priors, applied)
         self._excited = None if ways is None or ways.shape[1] == len(ways) else ways @ ways.T
         self._stack = _stack(data, held, self.nuisances.applied_response, self._excited)
         self.known = np.array([np.isfinite(p.gravity_mps2).all() for p in held])
