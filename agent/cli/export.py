@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from agent.cli.data_dir import DATA_DIR
 from agent.terminal.text import say
+
+if TYPE_CHECKING:
+    from agent.export.samples import Content
+    from agent.export.smoothing import Smoothed
+
+ENDINGS = (".csv", ".parquet", ".wav", ".mseed")
+NUMBERED = ENDINGS[:2]  # the formats that can name a calibration for each sample
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -14,44 +24,56 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.command()
 @click.argument("recordings", nargs=-1, required=True, type=_FILE, metavar="RECORDING...")
 @click.option(
-    "--to", type=_FILE, metavar="FILE", help="Table of samples: .csv, .parquet, .wav or .mseed; it must not exist."
+    "-o",
+    "--to",
+    type=_FILE,
+    metavar="FILE",
+    help="Table of samples: .csv, .parquet, .wav or .mseed; it must not exist.",
 )
 @click.option("--mcap", type=_FILE, metavar="FILE", help="Topics of ROS 2 for plot programs; it must not exist.")
 @click.option("--device", metavar="NAME", help="The device. Default: the only sensor of the recordings.")
 @click.option(
-    "--rate-hz", type=click.FloatRange(min=0.01, max=1e6), default=100.0, show_default=True,
+    "--rate-hz",
+    type=click.FloatRange(min=0.01, max=1e6),
+    default=100.0,
+    show_default=True,
     help="Messages per second in --mcap, each the mean of the samples in its interval.",
-)  # fmt: skip
-def export(recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, device: str | None, rate_hz: float) -> int:
+)
+@click.option(
+    "--corrected",
+    is_flag=True,
+    help="Accelerations by S(t) and Q(t), smoothed over the past: by all windows up to the end of the recordings.",
+)
+@DATA_DIR
+def export(
+    recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, device: str | None, rate_hz: float,
+    corrected: bool, data_dir: Path | None,
+) -> int:  # fmt: skip
     """Write the samples of RECORDING (several: in the order given) with the times of their clock.
 
-    A sensor has its indications and, where it was calibrated, accelerations by the newest calibration.
+    A sensor has its indications and, where it was calibrated, accelerations by the newest calibration. With --corrected
+    they are those by S and Q at the time of each sample, by all windows before and after it, and each sample has the
+    number of the calibration that was in force then; the head of the file says what the smoothing follows from. The
+    windows are those up to the end of the recordings, or with --data-dir all that the agent has kept.
 
     Exit status 0 if the files are written, 2 on bad input.
     """
-    from agent.export.plots import write_plots
-    from agent.export.samples import ExportError, content_of, samples
-    from agent.export.seismic import write_mseed
-    from agent.export.tables import write_csv, write_parquet, write_wav
+    from agent.delivery.history import StoreError
+    from agent.export.samples import ExportError, content_of
 
-    formats = {".csv": write_csv, ".parquet": write_parquet, ".wav": write_wav, ".mseed": write_mseed}
-    if to is None and mcap is None:
-        raise click.UsageError("nothing to write; add --to FILE, --mcap FILE, or both")
-    if to is not None and to.suffix not in formats:
-        raise click.BadParameter(f"{to}: the ending must be one of {', '.join(formats)}", param_hint="--to")
+    _check(to, mcap, data_dir, corrected=corrected)
     try:
         content = content_of(recordings, device)
+        if corrected:
+            content.smoothed = _smoothed(recordings, content, data_dir)
         for fault in content.faults:
             say(f"fieldcal export: {fault}", err=True)
-        if not content.calibrations and content.axes == 3:
+        if not (content.calibrations or corrected) and content.axes == 3:
             say(f"fieldcal export: {content.device} has no calibration: no accelerations are written", err=True)
-        if to is not None:
-            rows = formats[to.suffix](to, content, samples(recordings, content))
-            say(f"{to}: {rows} samples of {content.device}")
-        if mcap is not None:
-            count = write_plots(mcap, content, samples(recordings, content), rate_hz)
-            say(f"{mcap}: {count} messages of {content.device} at {rate_hz:g} Hz")
-    except ExportError as error:
+        _write(recordings, content, to, mcap, rate_hz)
+        for why, number in content.left_out.items():
+            say(f"fieldcal export: {number} samples have no acceleration: {why}", err=True)
+    except (ExportError, StoreError) as error:
         say(f"fieldcal export: {error}", err=True)
         return 2
     except FileExistsError as error:
@@ -61,3 +83,50 @@ def export(recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, dev
         say(f"fieldcal export: {error.filename or to or mcap}: {error.strerror}", err=True)
         return 2
     return 0
+
+
+def _check(to: Path | None, mcap: Path | None, data_dir: Path | None, *, corrected: bool) -> None:
+    """Raise click.UsageError for options that do not go together."""
+    if to is None and mcap is None:
+        raise click.UsageError("nothing to write; add --to FILE, --mcap FILE, or both")
+    if to is not None and to.suffix not in ENDINGS:
+        raise click.BadParameter(f"{to}: the ending must be one of {', '.join(ENDINGS)}", param_hint="--to")
+    if corrected and (to is None or to.suffix not in NUMBERED or mcap is not None):
+        raise click.UsageError(f"--corrected writes one file with the ending {' or '.join(NUMBERED)}; name it with -o")
+    if data_dir is not None and not corrected:
+        raise click.UsageError("--data-dir names the windows for --corrected; add that, or remove --data-dir")
+
+
+def _write(recordings: Sequence[Path], content: Content, to: Path | None, mcap: Path | None, rate_hz: float) -> None:
+    """Write the files. Raises ExportError, OSError."""
+    from agent.export.plots import write_plots
+    from agent.export.samples import samples
+    from agent.export.seismic import write_mseed
+    from agent.export.tables import write_csv, write_parquet, write_wav
+
+    if to is not None:
+        writers = write_csv, write_parquet, write_wav, write_mseed
+        rows = dict(zip(ENDINGS, writers, strict=True))[to.suffix](to, content, samples(recordings, content))
+        say(f"{to}: {rows} samples of {content.device}")
+    if mcap is not None:
+        count = write_plots(mcap, content, samples(recordings, content), rate_hz)
+        say(f"{mcap}: {count} messages of {content.device} at {rate_hz:g} Hz")
+
+
+def _smoothed(recordings: Sequence[Path], content: Content, data_dir: Path | None) -> Smoothed:
+    """The past by the states where the recordings end, or by those in a data directory."""
+    from agent.cli.kernels import compute_as_in
+    from agent.delivery.history import FILE_NAME, History
+    from agent.export.at_the_end import memories_at_the_end
+    from agent.export.samples import ExportError
+    from agent.export.smoothing import smoothed
+
+    compute_as_in(recordings[0])
+    if content.axes != 3:
+        raise ExportError(f"{recordings[0]}: {content.device} has {content.axes} axis; S and Q are those of three axes")
+    if data_dir is None:
+        memories = memories_at_the_end(recordings)
+    else:
+        with History(data_dir / FILE_NAME) as history:
+            memories = history.memories()
+    return smoothed(memories, content.device)

@@ -19,6 +19,7 @@ from agent.terminal.quantity import counted, size
 from agent.terminal.text import one_line, say
 
 if TYPE_CHECKING:
+    from agent.config.known_keys import KnownKeys
     from agent.terminal.console import TextConsole
 
 HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
@@ -27,30 +28,87 @@ HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
 @click.command()
 @click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True, metavar="D",
               help="Where the agent keeps recordings and state.")  # fmt: skip
-@click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
+@click.option("--json", "json_to", metavar="-|FILE", help="One JSON object on standard output, or in FILE.")
+@click.option(
+    "--past", is_flag=True, help="Show S(t), Q(t) and U(t) of the past instead, by all windows that the agent has kept."
+)
+@click.option(
+    "--csv",
+    "csv_to",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="With --past: a row for each epoch; the file must not exist.",
+)
 @click.option("--public-key", metavar="K", type=click.Path(path_type=Path),
               help="Show only results that this key (PEM) signed.")  # fmt: skip
 @click.option("--limit", type=click.IntRange(1), default=HISTORY_SHOWN, show_default=True, metavar="N",
               help="Show the newest N calibrations and windows of each sensor.")  # fmt: skip
-def show(data_dir: Path, json_to: str | None, public_key: Path | None, limit: int) -> int:
+def show(
+    data_dir: Path, json_to: str | None, past: bool, csv_to: Path | None, public_key: Path | None, limit: int
+) -> int:  # fmt: skip
     """Show calibration in force, status, history and recordings of a data directory.
 
     A result that the gateway signed is shown as it was signed. One whose signature is not valid is not shown.
+
+    With --past: S and Q with U at each epoch, by all windows before and after it, with the number of the calibration
+    that was in force then, and what changed at once. Old windows are merged to hours, days, weeks, months and years.
 
     Exit status 2 if there is no store, or if it cannot be read; 3 if a result is refused, with the reasons.
     """
     from agent.config.key_file import KeyFileError
 
+    if csv_to is not None and not past:
+        raise click.UsageError("--csv writes the past; add --past, or remove --csv")
     try:
+        if past:
+            return _show_past(data_dir, json_to, csv_to, public_key)
         overview = read_overview(data_dir, limit, public_key)
         if json_to:
-            click.echo(msgspec.json.encode(as_object(overview)).decode())
+            _write_json(as_object(overview), json_to)
         else:
             _print(overview)
     except (StoreError, KeyFileError) as error:
         say(f"fieldcal show: {error}", err=True)
         return 2
+    except OSError as error:
+        say(f"fieldcal show: {error.filename or data_dir}: {error.strerror}", err=True)
+        return 2
     return 3 if overview.refused else 0
+
+
+def _write_json(found: dict[str, Any], to: str) -> None:
+    data = msgspec.json.encode(found)
+    if to == "-":
+        click.echo(data.decode())
+    else:
+        Path(to).write_bytes(data + b"\n")
+
+
+def _show_past(data_dir: Path, json_to: str | None, csv_to: Path | None, public_key: Path | None) -> int:
+    """Show the past of all sensors; returns the exit status. Raises StoreError, KeyFileError, OSError."""
+    from agent.export.past import as_object as past_object
+    from agent.export.past import lines, pasts, write_csv
+
+    with History(data_dir / FILE_NAME, keys := _keys(public_key), signed_only=keys is not None) as history:
+        history.check()
+        found = pasts(history)
+    for sequence, reason in sorted(history.refused.items()):
+        say(f"fieldcal show: result {sequence} is refused: {reason}", err=True)
+    if csv_to is not None:
+        say(f"{csv_to}: {write_csv(csv_to, found)} epochs", err=json_to == "-")
+    if json_to:
+        _write_json({"version": __version__, "data_dir": str(data_dir), "past": past_object(found)}, json_to)
+    elif csv_to is None:
+        for line in [line for one in found for line in lines(one)] or [f"{data_dir}: no state is kept yet"]:
+            say(line)
+    return 3 if history.refused else 0
+
+
+def _keys(public_key: Path | None) -> KnownKeys | None:
+    from agent.config.known_keys import KnownKeys
+    from agent.recording.signing import load_public_key
+
+    return None if public_key is None else KnownKeys(anywhere=(load_public_key(public_key).public_bytes_raw(),))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +149,10 @@ def read_overview(data_dir: Path, limit: int, public_key: Path | None = None) ->
 
     `public_key`: only results that it signed.
     """
-    from agent.config.known_keys import KnownKeys
     from agent.delivery.evidence import evidence, signed_with
     from agent.recording.files import recordings
-    from agent.recording.signing import load_public_key
 
-    keys = KnownKeys(anywhere=(load_public_key(public_key).public_bytes_raw(),)) if public_key is not None else None
+    keys = _keys(public_key)
     with History(data_dir / FILE_NAME, keys, signed_only=keys is not None) as history:
         history.check()
         in_force = {record.sensor: record for record in history.latest() if record.what == "calibration"}

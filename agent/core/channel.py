@@ -294,7 +294,8 @@ class ChannelState:
         """State of the device that is connected now, for later runs."""
         assert self._estimation is not None
         day = self._first_day + self._time.now_s / DAY_S
-        return keep(self._filters, self._device, self._estimation, self._in_force, day, self._time.utc_ns)
+        held = self._filters, self._device, self._estimation, self._in_force, self._nominal
+        return keep(*held, day, self._time.utc_ns)
 
     def memories(self) -> dict[str, bytes]:
         """`memory` by identity: of the device that is connected now and of those that were connected before."""

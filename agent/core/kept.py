@@ -70,13 +70,19 @@ def keep(
     device: str,
     estimation: Estimation,
     in_force: CalibrationUpdate | None,
+    nominal: float | None,
     day: float,
     t_utc_ns: int,
 ) -> bytes:
-    """The state for `take_up`, as bytes. `device` is the sensor, see agent.core.identity.device_of."""
+    """The state for `take_up`, as bytes. `device` is the sensor, see agent.core.identity.device_of.
+
+    The channel as it is configured and `nominal`, the sensitivity by the data sheet, are for `past_of`.
+    """
     return pack(
         {
             "in_force": plain(in_force),
+            "channel": filters.configured.model_dump_json(),
+            "nominal": nominal,
             "basis": _basis(filters.configured),
             "filters": filters.snapshot(),
             "device": device,
@@ -165,12 +171,13 @@ def _from_in_force(
 def kept_as(kept: Mapping[str, bytes], identity: str, device: str) -> str:
     """The identity of the newest kept state of a sensor, with its present settings or with others of its filters; ""
     where there is none."""
-    told = {name: _device_and_time(state) for name, state in kept.items()}
+    told = {name: device_and_time(state) for name, state in kept.items()}
     own = [name for name, (of, _) in told.items() if name == identity or of == device]
     return max(own, key=lambda name: told[name][1], default="")
 
 
-def _device_and_time(kept: bytes) -> tuple[str, int]:
+def device_and_time(kept: bytes) -> tuple[str, int]:
+    """The device of a kept state, and when it was kept (UTC, ns); "" and 0 where it cannot be read."""
     try:
         state = unpack(kept)
         return str(state["device"]), int(state["t_utc_ns"])

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Collection
+from bisect import bisect_right
+from collections.abc import Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote
 
+from agent.core.memory import Memory
 from agent.delivery.record import JOINED, Record
 from agent.delivery.schema import (
     SCHEMA_VERSION,
@@ -19,6 +21,8 @@ from agent.delivery.schema import (
     checked,
     damage,
     known_version,
+    read_memories,
+    read_states,
     version_of,
 )
 
@@ -28,6 +32,10 @@ if TYPE_CHECKING:
 __all__ = ["FILE_NAME", "History", "Record", "Removed", "StoreError", "connect_read_only"]
 
 FILE_NAME = "state.sqlite"
+_SAYS = "iif(json_valid(CAST(payload AS TEXT)), json_extract(CAST(payload AS TEXT), '$.status'), NULL)"
+_IN_FORCE = f"""
+SELECT t_utc_ns, sequence, what = 'calibration' FROM results
+WHERE sensor = ? AND (what = 'calibration' OR (what = 'status' AND {_SAYS} = 'UNCALIBRATED')) ORDER BY 1, 2"""
 _EPOCH_OF = "ifnull(iif(json_valid(CAST(payload AS TEXT)), json_extract(CAST(payload AS TEXT), '$.epoch'), NULL), '')"
 
 
@@ -133,6 +141,29 @@ class History:
         """The calibration in force of a sensor; None if it has none, or if a later status was UNCALIBRATED."""
         return next((r for r in self.latest() if r.sensor == sensor and r.what == "calibration"), None)
 
+    def in_force_at(self, sensor: str, times_utc_ns: Sequence[int]) -> list[Record | None]:
+        """The calibration that was in force at each time, as far as results of that time are kept."""
+        rows = self._rows(_IN_FORCE, sensor)
+        starts, found = [row[0] for row in rows], dict[int, Record | None]({-1: None})
+        ends = [bisect_right(starts, t) - 1 for t in times_utc_ns]
+        for k in set(ends) - {-1}:
+            _, sequence, calibrates = rows[k]
+            records = self.after(sequence - 1, [(sensor, "calibration")], limit=1) if calibrates else []
+            found[k] = next((record for record in records if record.sequence == sequence), None)
+        return [found[k] for k in ends]
+
+    def memories(self) -> list[Memory]:
+        """The states of the estimation that are kept, those of a sensor oldest first. With `keys`, `refused` gets the
+        reason, by their number, where none of these keys signed all of them."""
+        try:
+            memories, signed = read_memories(self._connection), read_states(self._connection)
+        except (sqlite3.Error, DamagedRow, UnicodeDecodeError) as error:
+            raise StoreError(f"{self._path}: {error}") from None
+        if self._keys is None or not (fault := _state_fault(signed, memories, self._keys)):
+            return memories
+        self.refused |= dict.fromkeys([memory.sequence for memory in memories], f"the kept states: {fault}")
+        return []
+
     def calibrations(self, sensor: str) -> dict[str, Record]:
         """The newest calibration of each device that a sensor ever had, by identity (kind, serial number, settings)."""
         rows = self._rows(
@@ -231,6 +262,17 @@ class History:
                 return cursor.fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:
             raise StoreError(f"{self._path}: {error}") from None
+
+
+def _state_fault(signed: bytes, memories: Sequence[Memory], keys: KnownKeys) -> str:
+    """Why these are not the states that one of the keys signed; "" where they are."""
+    from agent.delivery.signed_states import StateList, gateway_of
+    from agent.recording.signed_text import SignedTextError
+
+    try:
+        return StateList.read(signed, gateway_of(signed), keys).fault(memories)
+    except SignedTextError as error:
+        return str(error)
 
 
 def connect_read_only(path: Path) -> sqlite3.Connection:

@@ -32,6 +32,11 @@ def digest_of(memory: Memory) -> tuple[int, str]:
     return memory.sequence, hashlib.sha256(memory.state).hexdigest()
 
 
+def gateway_of(data: bytes) -> str:
+    """The gateway that a signed list names. Raises SignedTextError where it is none."""
+    return values_of(SignedText.read(data, LARGEST).text, _PURPOSE, _NAMES)[0]
+
+
 @dataclass(frozen=True, slots=True)
 class StateList:
     """The states that a gateway keeps for later runs.

@@ -1,9 +1,10 @@
-"""Samples of recordings with the times of the clock model, and the accelerations that the newest calibration gives."""
+"""Samples of recordings with the times of the clock model, and the accelerations that the newest calibration gives, or
+S and Q smoothed over the past."""
 
 from __future__ import annotations
 
 import json
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config import recorded_config
-from agent.core.events import CalibrationUpdate, DeviceChange, RunStart
+from agent.core.events import CalibrationUpdate, DeviceChange, RunStart, StatusChange
+from agent.core.identity import device_of, identity_of
 from agent.core.kept import update_of
 from agent.core.snapshot import unpack
 from agent.core.stream import UNCOUNTED, DeviceStream
+from agent.export.smoothing import Smoothed
 from agent.recording.reading import RecordingReader, Step, first_event
 from calib.model import Array
 from hw.block import SampleBlock
@@ -34,7 +37,8 @@ class Samples:
     """Consecutive samples of one device: `t_utc_ns` (n,) by its clock, `values` (n, axes) in `unit`.
 
     `acceleration` (n, 3) in m/s2, None without a calibration. `first_index`: number of the first sample in the device's
-    own count. `rate_hz`: of the clock.
+    own count. `rate_hz`: of the clock. `calibration`: number of the one that was in force then, by which it came into
+    force first; 0 where none was.
     """
 
     t_utc_ns: NDArray[np.int64]
@@ -43,17 +47,24 @@ class Samples:
     first_index: int
     rate_hz: float
     temperature_degc: float | None
+    calibration: int = 0
 
 
 @dataclass(slots=True)
 class Content:
-    """What recordings have of one device: `calibrations` in order of time, the first may be older than the files."""
+    """What recordings have of one device: `calibrations` in order of time, the first may be older than the files.
+
+    `smoothed`: the past by which its samples are corrected, if that was asked for. `left_out`: how many samples get no
+    acceleration by it, by the reason.
+    """
 
     device: str
     unit: str = "count"
     axes: int = 0
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
+    smoothed: Smoothed | None = None
+    left_out: Counter[str] = field(default_factory=Counter)
 
 
 @contextmanager
@@ -68,15 +79,15 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def _followed(path: Path) -> Iterator[None]:
-    """Raises ExportError where the samples cannot follow the recording from its snapshot."""
+def followed(path: Path) -> Iterator[None]:
+    """Raises ExportError where what is done within does not follow from the snapshot of the recording."""
     try:
         yield
     except ExportError:
         raise
     except Exception as error:  # a damaged or forged snapshot may raise any exception
         raise ExportError(
-            f"{path}: its samples cannot be followed from its snapshot: {type(error).__name__}: {error!s:.200}; "
+            f"{path}: its content does not follow from its snapshot: {type(error).__name__}: {error!s:.200}; "
             f"`fieldcal audit {path}` says more"
         ) from None
 
@@ -88,8 +99,8 @@ def content_of(paths: Sequence[Path], device: str | None) -> Content:
         raise ExportError(f"{paths[0]}: has the sensors {', '.join(names)}; choose one with --device")
     found = Content(device or names[0])
     for path in paths:
-        with _followed(path):
-            for step in _steps(path, found.faults):
+        with followed(path):
+            for step in steps_of(path, found.faults):
                 _look(step, found)
     if not found.axes:
         raise ExportError(f"{paths[0]}: has no samples of {found.device!r}; its sensors are {', '.join(names)}")
@@ -97,15 +108,26 @@ def content_of(paths: Sequence[Path], device: str | None) -> Content:
 
 
 def samples(paths: Sequence[Path], content: Content) -> Iterator[Samples]:
-    """The samples of the device in order. A block whose samples get no time from the clock is left out."""
+    """The samples of the device in order. A block whose samples get no time from the clock is left out.
+
+    Raises ExportError, also where S and Q smoothed over the past are asked for and correct no sample.
+    """
+    corrected = content.smoothed is None
     for path in paths:
-        start = _start(path)
-        with _followed(path):
-            clocked = _Clocked(start, content)
-            for step in _steps(path, []):
-                if isinstance(step.event, SampleBlock) and step.event.device == content.device and step.event.n:
-                    yield from clocked.update(step.event)
-            yield from clocked.rest()
+        for block in _of_file(path, content):
+            corrected |= block.acceleration is not None
+            yield block
+    if not corrected:
+        raise ExportError(f"{content.device}: no sample can be corrected: {'; '.join(content.left_out)}")
+
+
+def _of_file(path: Path, content: Content) -> Iterator[Samples]:
+    start = start_of(path)
+    with followed(path):
+        clocked = _Clocked(start, content)
+        for step in steps_of(path, []):
+            yield from clocked.update(step)
+        yield from clocked.rest()
 
 
 def acceleration(values: Array, calibration: CalibrationUpdate, degc: float | None) -> Array | None:
@@ -123,23 +145,50 @@ def acceleration(values: Array, calibration: CalibrationUpdate, degc: float | No
         return None
 
 
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A block that waits for its clock, with the device that sent it and the calibration that was in force then."""
+
+    block: SampleBlock
+    device: str
+    calibration: int
+
+
 class _Clocked:
     """The clock of one device in one file, and the blocks that wait for it."""
 
     def __init__(self, start: RunStart, content: Content) -> None:
         self._content = content
-        self._waiting: deque[SampleBlock] = deque()
+        self._waiting: deque[_Waiting] = deque()
         self._stream, origin_ns = _stream(start, content.device)
         self._origin_utc_ns = start.t_utc_ns - start.t_monotonic_ns + origin_ns
+        channel = unpack(start.snapshot)["channels"].get(content.device, {})
+        in_force = update_of(channel.get("in_force"))
+        self._identity, self._device = channel.get("identity", ""), channel.get("device", "")
+        self._calibration = 0 if in_force is None else in_force.made[1]
 
-    def update(self, block: SampleBlock) -> Iterator[Samples]:
-        """Take the next block; yield those that have waited long enough."""
+    def update(self, step: Step) -> Iterator[Samples]:
+        """Take the next event; yield the blocks that have waited long enough."""
+        event, name = step.event, self._content.device
+        if isinstance(event, DeviceChange) and event.device == name and event.info_json:
+            identity, self._device = identity_of(event.info_json), device_of(json.loads(event.info_json))
+            self._calibration = self._calibration if identity == self._identity else 0
+            self._identity = identity
+        if isinstance(event, SampleBlock) and event.device == name and event.n:
+            yield from self._take(event)
+        for result in step.results:
+            if isinstance(result, CalibrationUpdate) and result.sensor == name:
+                self._calibration = result.made[1]
+            elif isinstance(result, StatusChange) and result.sensor == name and result.status == "UNCALIBRATED":
+                self._calibration = 0
+
+    def _take(self, block: SampleBlock) -> Iterator[Samples]:
         if block.flags & UNCOUNTED:
             yield from self.rest()
         self._stream.update(block)
-        self._waiting.append(block)
+        self._waiting.append(_Waiting(block, self._device, self._calibration))
         newest_ns = block.t_monotonic_ns
-        while newest_ns - self._waiting[0].t_monotonic_ns > DELAY_S * 1e9:
+        while newest_ns - self._waiting[0].block.t_monotonic_ns > DELAY_S * 1e9:
             yield from self._timed(self._waiting.popleft())
         newest_s = self._stream.newest_arrival_s
         if newest_s is not None:
@@ -150,23 +199,27 @@ class _Clocked:
         while self._waiting:
             yield from self._timed(self._waiting.popleft())
 
-    def _timed(self, block: SampleBlock) -> Iterator[Samples]:
-        told = self._stream.clock()
+    def _timed(self, waiting: _Waiting) -> Iterator[Samples]:
+        told, block, content = self._stream.clock(), waiting.block, self._content
         if told is None:
             return
         clock = told[0]
         if not 0.0 < clock.rate_hz < np.inf:
             raise ExportError(
-                f"{self._content.device}: the times of its samples do not rise (rate {clock.rate_hz:.3g} Hz), so that "
+                f"{content.device}: the times of its samples do not rise (rate {clock.rate_hz:.3g} Hz), so that "
                 "they cannot be exported; `fieldcal audit` says whether the recording is damaged"
             )
         times_s = clock.time_of(block.first_index + np.arange(block.n))
         values = np.asarray(block.indications, dtype=np.float64)
-        newest = self._content.calibrations[-1] if self._content.calibrations else None
-        degc = block.temperature_degc
-        a = None if newest is None or values.shape[1] != 3 else acceleration(values, newest, degc)
-        t_utc_ns = self._origin_utc_ns + np.round(times_s * 1e9).astype(np.int64)
-        yield Samples(t_utc_ns, values, a, block.first_index, clock.rate_hz, degc)
+        t_utc_ns, degc, a = self._origin_utc_ns + np.round(times_s * 1e9).astype(np.int64), block.temperature_degc, None
+        if content.smoothed is not None:
+            middle_ns = int(t_utc_ns[len(t_utc_ns) // 2])
+            a, why = content.smoothed.acceleration(waiting.device, values, middle_ns, degc)
+            if why:
+                content.left_out[why] += block.n
+        elif content.calibrations and values.shape[1] == 3:
+            a = acceleration(values, content.calibrations[-1], degc)
+        yield Samples(t_utc_ns, values, a, block.first_index, clock.rate_hz, degc, waiting.calibration)
 
 
 def _stream(start: RunStart, device: str) -> tuple[DeviceStream, int]:
@@ -193,7 +246,7 @@ def _look(step: Step, found: Content) -> None:
     found.calibrations += [r for r in step.results if isinstance(r, CalibrationUpdate) and r.sensor == found.device]
 
 
-def _steps(path: Path, faults: list[str]) -> Iterator[Step]:
+def steps_of(path: Path, faults: list[str]) -> Iterator[Step]:
     """Yield the steps of a file; why it ends early is added to `faults`. Raises ExportError for a damaged one."""
     reader = RecordingReader(path)
     try:
@@ -209,12 +262,13 @@ def _steps(path: Path, faults: list[str]) -> Iterator[Step]:
 def sensors_of(path: Path) -> list[str]:
     """The sensors of a recording's configuration. Raises ExportError."""
     try:
-        return [channel.sensor for channel in recorded_config(_start(path).config_json).channels]
+        return [channel.sensor for channel in recorded_config(start_of(path).config_json).channels]
     except ValueError as error:
         raise ExportError(f"{path}: its configuration cannot be read: {error}") from None
 
 
-def _start(path: Path) -> RunStart:
+def start_of(path: Path) -> RunStart:
+    """The first event of a recording. Raises ExportError."""
     try:
         start = first_event(path)
     except OSError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.export.samples import Content, ExportError, Samples, new_file
+from agent.terminal.text import one_line
 from calib.model import Array
 
 QUANTITIES = {"m/s2": "a", "m/s": "v", "m": "d"}  # name of the column of a uniaxial device, by its unit
@@ -23,22 +24,37 @@ WAV_FLOAT = 3
 def names_of(content: Content) -> list[str]:
     """Columns without the time: indications as `fieldcal calibrate` names them, then accelerations in m/s2."""
     if content.axes == 3:
-        return ["vx", "vy", "vz", *(["ax", "ay", "az"] if content.calibrations else [])]
+        return ["vx", "vy", "vz", *(["ax", "ay", "az"] if content.calibrations or content.smoothed else [])]
     return [QUANTITIES.get(content.unit, f"indication_{content.unit}")]
 
 
 def write_csv(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
-    """Write `time_s` (UTC since 1970, all nine digits) and the columns; `nan` is a value that is not there."""
-    rows = 0
+    """Write `time_s` (UTC since 1970, all nine digits) and the columns; `nan` is a value that is not there.
+
+    Samples that are corrected by S and Q smoothed over the past have a last column, `calibration`, and lines with # at
+    the head that say by what.
+    """
+    rows, head = 0, [f"# {name}: {text}\n" for name, text in _about(content).items()]
+    names = ["time_s", *names_of(content), *(["calibration"] if content.smoothed else [])]
     with new_file(path) as file:
-        file.write((",".join(map(cell, ["time_s", *names_of(content)])) + "\n").encode())
+        file.writelines(map(str.encode, [*head, ",".join(map(cell, names)) + "\n"]))
         for block in blocks:
             times = (f"{t // 10**9}.{t % 10**9:09d}" for t in block.t_utc_ns.tolist())
             values = columns(content, block).tolist()
-            lines = (f"{t},{','.join(map(repr, row))}\n" for t, row in zip(times, values, strict=True))
+            end = f",{block.calibration}\n" if content.smoothed else "\n"
+            lines = (f"{t},{','.join(map(repr, row))}{end}" for t, row in zip(times, values, strict=True))
             file.writelines(map(str.encode, lines))
             rows += len(values)
     return rows
+
+
+def _about(content: Content) -> dict[str, str]:
+    """What a table of corrected samples says of itself."""
+    if content.smoothed is None:
+        return {}
+    told = {name: one_line(text) for name, text in content.smoothed.told.items()}
+    runs = dict.fromkeys(update.made[0] for update in content.calibrations)
+    return {"device": one_line(content.device), **told, "runs of the calibrations": one_line(", ".join(runs))}
 
 
 def cell(text: str) -> str:
@@ -56,12 +72,15 @@ def write_parquet(path: Path, content: Content, blocks: Iterable[Samples]) -> in
         raise ExportError(f"{path}: Parquet needs pyarrow; install it with: fieldcal extras --install files") from None
     names = names_of(content)
     time = pa.timestamp("ns", tz="UTC")
-    about = {"device": content.device, "unit": content.unit, "ax, ay, az": "m/s2"}
-    schema = pa.schema([("time", time), *((name, pa.float64()) for name in names)], metadata=about)
+    about = {"device": content.device, "unit": content.unit, "ax, ay, az": "m/s2", **_about(content)}
+    numbered = [("calibration", pa.int64())] if content.smoothed else []
+    fields = [("time", time), *((name, pa.float64()) for name in names), *numbered]
+    schema = pa.schema(fields, metadata=about)
     rows = 0
     with new_file(path) as file, parquet.ParquetWriter(file, schema) as writer:
-        for t_utc_ns, values in _gathered(content, blocks):
+        for t_utc_ns, values, numbers in _gathered(content, blocks):
             arrays = [pa.array(t_utc_ns, time), *(pa.array(column) for column in values.T)]
+            arrays += [pa.array(numbers)] if content.smoothed else []
             writer.write_table(pa.table(arrays, schema=schema))
             rows += len(values)
     return rows
@@ -102,7 +121,7 @@ def _wav_head(file: BinaryIO, channels: int, rate_hz: int, frames: int) -> None:
 
 def columns(content: Content, block: Samples) -> Array:
     """The columns (n, k) in the order of `names_of`."""
-    if content.axes != 3 or not content.calibrations:
+    if content.axes != 3 or not (content.calibrations or content.smoothed):
         return block.values
     none = np.full((len(block.values), 3), np.nan)
     return np.hstack([block.values, none if block.acceleration is None else block.acceleration])
@@ -110,15 +129,20 @@ def columns(content: Content, block: Samples) -> Array:
 
 def _gathered(
     content: Content, blocks: Iterable[Samples], rows: int = 1 << 16
-) -> Iterator[tuple[NDArray[np.int64], Array]]:
+) -> Iterator[tuple[NDArray[np.int64], Array, NDArray[np.int64]]]:
     """Blocks put together to pieces of about so many rows: a file with a part for each block would be slow to read."""
-    times: list[NDArray[np.int64]] = []
-    values: list[Array] = []
+    held: list[tuple[NDArray[np.int64], Array, NDArray[np.int64]]] = []
     for block in blocks:
-        times.append(block.t_utc_ns)
-        values.append(columns(content, block))
-        if sum(map(len, values)) >= rows:
-            yield np.concatenate(times), np.concatenate(values)
-            times, values = [], []
-    if values:
-        yield np.concatenate(times), np.concatenate(values)
+        held.append((block.t_utc_ns, columns(content, block), np.full(len(block.values), block.calibration)))
+        if sum(len(times) for times, _, _ in held) >= rows:
+            yield _joined(held)
+            held = []
+    if held:
+        yield _joined(held)
+
+
+def _joined(
+    held: Sequence[tuple[NDArray[np.int64], Array, NDArray[np.int64]]],
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
+    times, values, numbers = zip(*held, strict=True)
+    return np.concatenate(times), np.concatenate(values), np.concatenate(numbers)

@@ -76,27 +76,26 @@ def forward(root: Array, rows: Sequence[Array], passages: Sequence[Passage]) -> 
     return root, links
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Smoothed:
-    """All epochs by all rows: `d` (K, N), and their covariances `own` (K, N, N), (0, N, N) if nobody asked for them."""
-
-    d: Array
-    own: Array
-
-
-def backward(root: Array, links: Sequence[Link], *, covariance: bool = True) -> Smoothed:
-    """From the last epoch back to the first."""
-    last, factor = solved(root)
-    count, size = len(links) + 1, len(last)
-    d, own = np.zeros((count, size)), np.zeros((count if covariance else 0, size, size))
-    d[-1], own[-1:] = last, factor @ factor.T
-    for k in range(count - 2, -1, -1):
+def backward(root: Array, links: Sequence[Link]) -> Array:
+    """(K, N) d of all epochs by all rows, from the last epoch back to the first."""
+    last, _ = solved(root)
+    d = np.zeros((len(links) + 1, len(last)))
+    d[-1] = last
+    for k in range(len(links) - 1, -1, -1):
         link, p = links[k], links[k].passage
         inverse = np.linalg.inv(link.own)
         back = p.back @ p.noise
         d[k] = p.back @ (d[k + 1] - p.gap) - back @ (inverse @ (link.z - link.next @ d[k + 1]))
-        if covariance:
-            follows = p.back + back @ inverse @ link.next
-            left = back @ inverse
-            own[k] = follows @ own[k + 1] @ follows.T + left @ left.T
-    return Smoothed(d, own)
+    return d
+
+
+def returned(root: Array, link: Link) -> Array:
+    """The triangle (J + N, J + N + 1) of [w, d] before a link by all rows, where `root` (N, N + 1) is that of the epoch
+    after it by all rows. Its last N rows are what all rows say of the epoch before."""
+    p, j = link.passage, len(link.z)
+    follows = np.linalg.inv(p.back)
+    wide = np.vstack([np.column_stack([link.next, link.z]), root])
+    of_next, z = wide[:, :-1], wide[:, -1]
+    rows = np.column_stack([of_next @ p.noise, of_next @ follows, z - of_next @ p.gap])
+    rows[:j, :j] += link.own
+    return np.asarray(np.linalg.qr(rows, mode="r"))

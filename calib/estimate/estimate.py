@@ -12,7 +12,7 @@ Gauss-Newton: each pass linearises all lines at the estimate of the last one; QR
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from calib.distributions import coverage_factor
-from calib.estimate.chain import Link, Passage, Smoothed, backward, forward, passed, solved
+from calib.estimate.chain import Link, Passage, backward, forward, passed, returned, solved
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.physics import SIZE, STEP, Stack, Windows
 from calib.estimate.quantities import KINDS, LAG, RESPONSE, Quantity
@@ -201,6 +201,16 @@ class Now:
         return replace(self, root=root[:size], noise=self.noise.pooled(record), seen_degc=seen, chi2=self.chi2 + left)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Then:
+    """What all windows say of an epoch, `now`, and of what walks and steps changed from it to the next one: `moved`
+    (N,), and a factor (N, J) of its covariance."""
+
+    now: Now
+    moved: Array
+    moved_factor: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """`days` (K,) of the epochs, `x` (K, N) the point of linearisation, `root` the triangle of the last epoch, `links`
@@ -234,14 +244,17 @@ class Estimate:
             self.chi2,
         )
 
-    @cached_property
-    def smoothed(self) -> Smoothed:
-        """All epochs by all windows."""
-        return backward(self.root, self.links)
-
-    def past(self) -> tuple[Array, Array, Array]:
-        """Days (K,), S and Q (K, 12) and their covariances (K, 12, 12), each by all windows before it and after it."""
-        return self.days, (self.x + self.smoothed.d)[:, :12], self.smoothed.own[:, :12, :12]
+    def past(self) -> Iterator[Then]:
+        """All epochs by all windows before and after each, from the last one back to the first."""
+        root, size = self.root, len(self.unknowns)
+        yield Then(self.now, np.zeros(size), np.zeros((size, 0)))
+        for k in range(len(self.links) - 1, -1, -1):
+            link, j = self.links[k], len(self.links[k].z)
+            joint = returned(root, link)
+            d, factor = solved(joint)
+            root, noise = joint[j:, j:], link.passage.noise
+            then = replace(self.now, day=float(self.days[k]), x=self.x[k], around=self.around[k], root=root)
+            yield Then(then, noise @ d[:j], noise @ factor[:j])
 
 
 def estimate(
@@ -355,12 +368,12 @@ class _Solution:
             if start is not None and passes == 1:
                 best = None  # its values do not follow from one epoch to the next
             root, links = self._forward(x, stacked)
-            back = backward(root, links, covariance=False)
+            back = backward(root, links)
             _, factor = solved(root)
-            small = np.abs(back.d).max(axis=0) <= CONVERGED * np.linalg.norm(factor, axis=1)
+            small = np.abs(back).max(axis=0) <= CONVERGED * np.linalg.norm(factor, axis=1)
             if small.all():
                 break
-            x = x + back.d
+            x = x + back
             walked = _squares(links, back)
             if unsure:
                 self._rows = self._made(x[-1])
@@ -382,7 +395,7 @@ class _Solution:
         return forward(root, stacked, passages)
 
 
-def _squares(links: Sequence[Link], back: Smoothed) -> float:
+def _squares(links: Sequence[Link], back: Array) -> float:
     """The sum of squares of what walks and steps have moved."""
-    moved = (np.linalg.solve(link.own, link.z - link.next @ d) for link, d in zip(links, back.d[1:], strict=True))
+    moved = (np.linalg.solve(link.own, link.z - link.next @ d) for link, d in zip(links, back[1:], strict=True))
     return float(sum(float(w @ w) for w in moved))

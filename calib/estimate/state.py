@@ -7,6 +7,7 @@ again, and at the end of each day of the data, when old records are merged (cali
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
@@ -15,12 +16,13 @@ import numpy as np
 
 from calib.estimate.correction import Law
 from calib.estimate.determined import determined
-from calib.estimate.estimate import Estimate, Now, estimate
+from calib.estimate.estimate import Estimate, Now, Then, estimate
 from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation
 from calib.estimate.never_turned import never_turned
 from calib.estimate.nuisances import Priors
 from calib.estimate.over_frequency import OverFrequency, changed
+from calib.estimate.past import Change, Past, epoch_days
 from calib.estimate.quantities import ALL_RATES, KINDS, LAG, PRIORS, S_AND_Q, Quantity
 from calib.estimate.record import Record, together
 from calib.estimate.reference_share import ReferenceShare, share_in
@@ -113,12 +115,12 @@ class State:
             tuple(self._dated), self._held_mps2 if self._fixed else None,
         )  # fmt: skip
 
-    def estimate(self, noise: Noise | None = None) -> Estimate:
-        """The whole solved anew, the past as well; `noise`: None pools that of the records."""
-        also = [max(r.day for r in self._records)] if self._records else []
-        also += [step.day for step in self._steps if also and step.day > also[0]]
+    def estimate(self, noise: Noise | None = None, also: Sequence[float] = ()) -> Estimate:
+        """The whole solved anew, the past as well; `noise`: None pools that of the records. `also`: further epochs."""
+        days = [max(r.day for r in self._records)] if self._records else []
+        days += [step.day for step in self._steps if days and step.day > days[0]]
         start = self._now if self._records else None
-        return estimate(self._records, self.statements, start=start, also=also, noise=noise)
+        return estimate(self._records, self.statements, start=start, also=[*days, *also], noise=noise)
 
     @property
     def reference(self) -> str:
@@ -242,17 +244,29 @@ class State:
         """All unknowns (N,) and a factor of their covariance, with what the response over frequency adds to it; Q where
         the mean output of a fixed mount stands."""
         if self._read is None or self._read[0] is not self._now or self._read[1] != self.reference:
-            now = self._now
-            mean, factor = now.mean.copy(), self._over.factor(now, self.reference, self._priors[0]).copy()
-            held = (r for r in reversed(self._records) if np.isfinite(r.held_mps2).all())
-            if self._fixed and self._held_mps2 is not None and (record := next(held, None)) is not None:
-                under, by = now.under_gravity(record)
-                S, away = mean[:9].reshape(3, 3), record.held_mps2 - self._held_mps2
-                by = by - np.kron(np.eye(3), away) @ np.eye(9, len(now))
-                mean[9:12] -= under - S @ away
-                factor[9:12] -= by @ factor
-            self._read = now, self.reference, mean, factor
+            self._read = self._now, self.reference, *self._values_of(self._now)
         return self._read[2], self._read[3]
+
+    def _values_of(self, now: Now) -> tuple[Array, Array]:
+        mean, factor = now.mean.copy(), self._over.factor(now, self.reference, self._priors[0]).copy()
+        if (under_gravity := self._under_gravity(now)) is not None:
+            more, by = under_gravity
+            mean[9:12] -= more
+            factor[9:12] -= by @ factor
+        return mean, factor
+
+    def _under_gravity(self, now: Now) -> tuple[Array, Array] | None:
+        """By what the mean output of a fixed mount is more than Q (3,), with the derivatives (3, N); None of another
+        mount."""
+        record = None
+        for record in (r for r in reversed(self._records) if np.isfinite(r.held_mps2).all()):
+            if record.day <= now.day:
+                break
+        if not self._fixed or self._held_mps2 is None or record is None:
+            return None
+        under, by = now.under_gravity(record)
+        S, away = now.mean[:9].reshape(3, 3), record.held_mps2 - self._held_mps2
+        return under - S @ away, by - np.kron(np.eye(3), away) @ np.eye(9, len(now))
 
     def law(self, day: float | None = None) -> Law:
         """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
@@ -260,14 +274,45 @@ class State:
             waited = self.copy()
             waited._now = self._now.passed_to(day)
             return waited.law()
-        temperature, now = self._temperature, self._now
+        return self._law(self._now, *self._values())
+
+    def _law(self, now: Now, mean: Array, factor: Array) -> Law:
+        temperature = self._temperature
         order, rows = temperature.offset_order, temperature.sensitivity_order > 0
-        more = [now.index(quantity.key) for quantity, _ in temperature.terms(self.scale)]
-        chosen = [*range(12), *more]
-        mean, factor = (values[chosen] for values in self._values())
+        chosen = [*range(12), *(now.index(quantity.key) for quantity, _ in temperature.terms(self.scale))]
+        mean, factor = mean[chosen], factor[chosen]
         covariance, (low, high) = factor @ factor.T, self.temperature_range_degc
         told, u_beyond = self._determined(mean[:12], covariance[:12, :12]), temperature.u_offset_mps2[1] * self.scale
         return Law(mean, covariance, order, rows, self.reference_temperature_degc, low, high, u_beyond, told)
+
+    def past(self) -> Past:
+        """S and Q of all epochs by all windows; no epoch before any window."""
+        if not self._records:
+            return Past(np.zeros(0), (), (), (), np.inf, self.coverage_factor)
+        begin, counts = min(r.days[0] for r in self._records), Counter[float]()
+        for record in self._records:
+            counts[record.day] += record.windows
+        stated: dict[float, dict[str, float]] = {}
+        for step in self._steps:
+            if step.day > min(counts):
+                own = stated.setdefault(step.day, {})
+                own |= {key: float(np.hypot(u, own.get(key, 0.0))) for key, u in step.u.items()}
+        whole, laws, changes = self.estimate(also=epoch_days(counts, stated)), list[Law](), list[Change]()
+        days = whole.days.tolist()
+        for then, after in zip(whole.past(), [np.inf, *reversed(days)], strict=False):
+            laws.append(self._law(then.now, *self._values_of(then.now)))
+            if after in stated:
+                changes.append(Change(after, stated[after], *self._change_of(then)))
+        windows = [counts[day] for day in days]
+        return Past(whole.days, laws[::-1], windows, changes[::-1], begin, self.coverage_factor)
+
+    def _change_of(self, then: Then) -> tuple[Array, Array]:
+        """By how much S and Q changed (12,) from an epoch to the next one, and the standard uncertainties."""
+        whole = np.column_stack([then.moved, then.moved_factor])
+        moved = whole[:12].copy()
+        if (under_gravity := self._under_gravity(then.now)) is not None:
+            moved[9:] -= under_gravity[1] @ whole
+        return moved[:, 0], np.linalg.norm(moved[:, 1:], axis=1)
 
     def quantity(self, name: str) -> tuple[float, float]:
         """(value, u) of an unknown of the sensor, its mount or its present reference. Raises KeyError for another."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.chain import Passage, backward, forward, passed, solved, with_rows
+from calib.estimate.chain import Passage, backward, forward, passed, returned, solved, with_rows
 
 N, EPOCHS, CHANGES, ROWS = 6, 9, 3, 4
 
@@ -49,8 +49,16 @@ def test_the_last_epoch_and_all_earlier_ones_are_those_of_the_whole_problem(seed
     np.testing.assert_allclose(factor @ factor.T, last @ drawn.covariance @ last.T, rtol=0, atol=1e-9)
     back = backward(root, links)
     for k, (at, shift) in enumerate(zip(drawn.maps, drawn.shifts, strict=True)):
-        np.testing.assert_allclose(back.d[k], at @ drawn.solution + shift, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(back.own[k], at @ drawn.covariance @ at.T, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(back[k], at @ drawn.solution + shift, rtol=0, atol=1e-8)
+    for k in range(EPOCHS - 2, -1, -1):
+        joint = returned(root, links[k])
+        changes = np.eye(drawn.design.shape[1])[N + k * CHANGES : N + (k + 1) * CHANGES]
+        both = np.vstack([changes, drawn.maps[k]])
+        d, factor = solved(joint)
+        shift = np.append(np.zeros(CHANGES), drawn.shifts[k])
+        np.testing.assert_allclose(d, both @ drawn.solution + shift, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(factor @ factor.T, both @ drawn.covariance @ both.T, rtol=0, atol=1e-8)
+        root = joint[CHANGES:, CHANGES:]
 
 
 def test_epoch_by_epoch_it_is_the_same_as_at_once() -> None:

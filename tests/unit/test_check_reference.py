@@ -210,10 +210,12 @@ def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
 def test_a_second_reference_can_be_removed_and_added_again() -> None:
     found = sound(estimation())
     both, alone = configured(), configured(both=False)
-    single = take_up(keep(DriverFilters(both), "", found, None, 12.0, 0), DriverFilters(alone), None).estimation
+    single = take_up(keep(DriverFilters(both), "", found, None, None, 12.0, 0), DriverFilters(alone), None).estimation
     single.meet("A", "", 1.0)
     assert set(actions(judged(single, 110, 12, 4, turns=(FIRST,) * 4))) == {"take"}
-    again = met(take_up(keep(DriverFilters(alone), "", single, None, 16.0, 0), DriverFilters(both), None).estimation)
+    again = met(
+        take_up(keep(DriverFilters(alone), "", single, None, None, 16.0, 0), DriverFilters(both), None).estimation
+    )
     assert set(actions(judged(again, 111, 16, 8))) == {"take"}
     value, u = again.state.quantity("reference_y of B")
     assert (abs(value), u) < (0.003, 0.002)
@@ -223,7 +225,7 @@ def test_a_second_reference_can_be_removed_and_added_again() -> None:
 def test_a_changed_rotation_of_the_second_reference_loosens_the_mount() -> None:
     before, after = np.eye(3), np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     stated = [DriverFilters(configured(rotation=rotation.ravel().tolist())) for rotation in (before, after)]
-    turned = take_up(keep(stated[0], "", sound(estimation()), None, 12.0, 0), stated[1], None)
+    turned = take_up(keep(stated[0], "", sound(estimation()), None, None, 12.0, 0), stated[1], None)
     assert "check_rotation" in turned.reason
     assert turned.estimation.state.quantity("rotation_x of place 1")[1] > np.deg2rad(0.2)
 

@@ -35,7 +35,7 @@ def state_of(made_with: Channel) -> bytes:
     estimation = Estimation(made_with, None)
     state = estimation.state
     in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, state, state.shares, lambda _: None)
-    return keep(DriverFilters(made_with), "", estimation, in_force, 0.0, 5)
+    return keep(DriverFilters(made_with), "", estimation, in_force, None, 0.0, 5)
 
 
 def after(before: Channel, now: Channel) -> Kept:

@@ -1,0 +1,82 @@
+"""S(t), Q(t) and U(t) of a sensor's past, from its kept state: windows, statements and decisions."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from agent.config import Channel
+from agent.core.driver_filters import DriverFilters
+from agent.core.estimation import DAY_S, Estimation
+from agent.core.kept import MALFORMED, update_of
+from agent.core.memory import Memory
+from agent.core.snapshot import pack, unpack
+from calib.estimate.past import Past
+
+
+class PastError(ValueError):
+    """The past does not follow from a kept state. The message says why, and what to do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownPast:
+    """The past of a sensor by all windows of its kept state.
+
+    `identity`: of the device with its settings, `device`: without those of its filters. `sha256`: of the state from
+    which it follows. `unit`: of the output, "" where no calibration is in force. `day` is the day of the state at
+    `t_utc_ns`.
+    """
+
+    sensor: str
+    identity: str
+    device: str
+    unit: str
+    past: Past
+    sha256: str
+    day: float
+    t_utc_ns: int
+
+    def utc_ns(self, day: float) -> int:
+        """UTC of a day of the past, by the clock of the gateway when the state was kept."""
+        return self.t_utc_ns - round((self.day - day) * DAY_S * 1e9)
+
+    def day_of(self, t_utc_ns: int) -> float:
+        """The day of the past at a time."""
+        return self.day - (self.t_utc_ns - t_utc_ns) * 1e-9 / DAY_S
+
+    @property
+    def windows(self) -> int:
+        """How many windows it follows from."""
+        return sum(self.past.windows)
+
+    @property
+    def last_window_utc_ns(self) -> int:
+        """When the newest one was taken."""
+        return self.utc_ns(max(day for day, taken in zip(self.past.days, self.past.windows, strict=True) if taken))
+
+
+def past_of(memory: Memory) -> KnownPast:
+    """The past by all windows of a kept state. Raises PastError where it has none."""
+    try:
+        state = unpack(memory.state)
+        held = state.get("estimation")
+        if not isinstance(held, dict) or held.get("state") is None or "channel" not in state:
+            raise PastError(
+                "its state is of an earlier version, which kept no windows; it has a past after the next windows"
+            )
+        filters = DriverFilters(Channel.model_validate_json(state["channel"]))
+        filters.load(state["filters"])
+        estimation = Estimation(filters.channel, state["nominal"])
+        estimation.load(held)
+        in_force = update_of(state["in_force"])
+        unit = "" if in_force is None else in_force.output_unit
+        sha256 = hashlib.sha256(pack(held["state"])).hexdigest()
+        past = estimation.state.past()
+        day, t_utc_ns = float(state["day"]), int(state["t_utc_ns"])
+    except PastError:
+        raise
+    except MALFORMED as error:
+        raise PastError(f"its state cannot be read: {str(error) or type(error).__name__}".splitlines()[0]) from None
+    if not past.windows:
+        raise PastError("no window was taken yet; its past begins with the first one")
+    return KnownPast(memory.sensor, memory.identity, state["device"], unit, past, sha256, day, t_utc_ns)

@@ -1,0 +1,148 @@
+"""S(t), Q(t) and U(t) of the past: against one dense least-squares problem, and what stands between epochs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.estimate.estimate import Estimate
+from calib.estimate.nuisances import Priors
+from calib.estimate.past import FURTHEST_DAYS, REACH_DAYS, Past
+from calib.estimate.record import Record
+from calib.estimate.state import State
+from calib.estimate.wander import TemperatureModel, Wander
+from calib.model import PARAMETERS, Array
+from tests.building_windows import building_window
+from tests.clamp_windows import Q_TRUE, S_TRUE
+from tests.unit.test_estimate import MEAN, STILL, U
+
+DAYS = (0.0, 1.0, 2.5, 2.6, 17.0, 18.0, 18.5)
+WALKS = {"sensitivity": 2e-3, "offset_mps2": 0.02, "offset_rate_mps2": 1e-3}
+U_STEP, STEP_DAY = 0.1, float(np.nextafter(DAYS[3], np.inf))
+
+
+def filled(seed: int, *, fixed: bool = False) -> State:
+    """S_yy steps by 3 % between the fourth and the fifth window."""
+    random, S = np.random.default_rng(seed), S_TRUE.copy()
+    wander = Wander(dict(STILL.values) | WALKS)
+    state = State(MEAN, U, Priors(), wander, TemperatureModel(), fixed=fixed)
+    for k, day in enumerate(DAYS):
+        if k == 4:
+            S[1, 1] *= 1.03
+            state.step({"Syy": U_STEP})
+        state.update(Record.of(building_window(random, level_mps2=(0.1, 0.1, 0.1), S=S), day))
+    return state
+
+
+class Dense:
+    """One problem whose unknowns are S and Q at every epoch, the step, and all constants. The rows of windows are those
+    of the estimate; priors, walks, rates and the step are written down here by themselves. `values` (K, 12),
+    `covariance` (K, 12, 12); `step` in its own standard uncertainty, with `u_step`."""
+
+    def __init__(self, whole: Estimate) -> None:
+        self._rows: list[Array] = []
+        self.days, keys = whole.days.tolist(), list(whole.unknowns.at)
+        self._constants = {key: 12 * len(self.days) + n for n, key in enumerate(keys[12:])}
+        self._step = 12 * len(self.days) + len(self._constants)
+        self._row({self._step: 1.0}, 0.0, 1.0)
+        for n, own in enumerate(whole.unknowns.all):
+            self._row({n if n < 12 else self._constants[own.key]: 1.0}, own.mean, own.u)
+        for at, rows in zip(whole.epoch_of.tolist(), whole.rows, strict=True):
+            column = [12 * at + n if n < 12 else self._constants[key] for n, key in enumerate(keys)]
+            for line in rows:
+                seen = float(line[-1] + line[:-1] @ whole.x[at])
+                self._row(dict(zip(column, line[:-1].tolist(), strict=True)), seen, 1.0)
+        for k in range(len(self.days) - 1):
+            for n in range(12):
+                self._walk(k, n)
+        table = np.array(self._rows)
+        found, *_ = np.linalg.lstsq(table[:, :-1], table[:, -1], rcond=None)
+        factor = np.linalg.pinv(table[:, :-1], rcond=1e-15)
+        covariance, count = factor @ factor.T, 12 * len(self.days)
+        self.values = found[:count].reshape(-1, 12)
+        self.covariance = np.array([covariance[k : k + 12, k : k + 12] for k in range(0, count, 12)])
+        self.step, self.u_step = found[self._step], np.sqrt(covariance[self._step, self._step])
+
+    def _row(self, columns: dict[int, float], seen: float, u: float) -> None:
+        made = np.zeros(self._step + 2)
+        made[list(columns)] = np.array(list(columns.values())) / u
+        made[-1] = seen / u
+        self._rows.append(made)
+
+    def _walk(self, k: int, n: int) -> None:
+        """S or Q at an epoch after the one before: a Gauss-Markov process about a centre that rate and step move."""
+        before, after, name = self.days[k], self.days[k + 1], PARAMETERS[n]
+        a_day = (WALKS["sensitivity"] if n < 9 else WALKS["offset_mps2"]) ** 2  # output unit per m/s2: 1
+        kept = np.exp(-a_day * (after - before) / (2.0 * U[n] ** 2))
+        columns, rate = {12 * (k + 1) + n: 1.0, 12 * k + n: -kept}, self._constants.get(f"{name}_rate")
+        centre = self._constants.get(f"{name}, centre")
+        if rate is not None:
+            columns[rate] = -(after - before) - (1.0 - kept) * (before - self.days[0])
+        if centre is not None:
+            columns[centre] = -(1.0 - kept)
+        if name == "Syy":
+            columns[self._step] = -U_STEP * (float(before < STEP_DAY <= after) + (1.0 - kept) * (before >= STEP_DAY))
+        seen = 0.0 if centre is not None else (1.0 - kept) * MEAN[n]
+        self._row(columns, seen, max(U[n] * np.sqrt(1.0 - kept**2), 1e-10))
+
+
+def test_it_is_the_solution_of_one_dense_problem() -> None:
+    state = filled(1)
+    past = state.past()
+    dense = Dense(state.estimate(also=past.days.tolist()))
+    assert past.days.tolist() == dense.days
+    for law, value, own in zip(past.laws, dense.values, dense.covariance, strict=True):
+        u = np.sqrt(own.diagonal())
+        np.testing.assert_allclose(law.mean / u, value / u, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(law.covariance / np.outer(u, u), own / np.outer(u, u), rtol=0, atol=1e-5)
+    (change,) = past.changes
+    assert (change.day, change.stated) == (STEP_DAY, {"Syy": U_STEP})
+    assert change.found[4] == pytest.approx(U_STEP * dense.step, rel=1e-5)
+    assert change.standard_uncertainty[4] == pytest.approx(U_STEP * dense.u_step, rel=1e-4)
+    assert change.found[4] == pytest.approx(0.03 * S_TRUE[1, 1], abs=3.0 * change.standard_uncertainty[4])
+
+
+def test_epochs_stand_at_windows_on_both_sides_of_a_change_and_within_long_gaps() -> None:
+    past = filled(2).past()
+    assert past.days.tolist()[:5] == [*DAYS[:4], STEP_DAY]
+    assert np.diff(past.days).max() <= FURTHEST_DAYS
+    assert dict(zip(past.days.tolist(), past.windows, strict=True)) == {
+        day: int(day in DAYS) for day in past.days.tolist()
+    }
+    moved = [law.mean[4] for law in past.laws[3:5]]
+    assert moved[1] - moved[0] == pytest.approx(past.changes[0].found[4], abs=1e-9)
+
+
+def test_between_two_epochs_it_is_on_their_line_as_an_epoch_there_would_be() -> None:
+    state = filled(3)
+    past, day = state.past(), 9.9
+    whole = state.estimate(also=[*past.days.tolist(), day])
+    (then,) = (then.now for then in whole.past() if then.now.day == day)
+    there, u = past.at(day), np.sqrt(then.variance[:12])
+    np.testing.assert_allclose(there.mean / u, then.mean[:12] / u, rtol=0, atol=0.01)
+    np.testing.assert_allclose(np.sqrt(there.covariance.diagonal()), u, rtol=0.1)
+    first, last = past.at(past.begin - 1.0), past.at(past.days[-1] + 1.0)
+    np.testing.assert_array_equal(first.mean, past.laws[0].mean)
+    np.testing.assert_array_equal(last.mean, past.laws[-1].mean)
+    for outside in (past.begin - 1.01 * REACH_DAYS, past.days[-1] + 1.01 * REACH_DAYS):
+        assert not past.knows(outside)
+    assert past.knows(past.begin - 0.99 * REACH_DAYS)
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_the_last_epoch_is_the_present(fixed: bool) -> None:
+    """Of a fixed mount as well, where Q is read from the mean output: in the past from that of each epoch."""
+    state = filled(4, fixed=fixed)
+    past, now, u = state.past(), state.law(), state.result().standard_uncertainty
+    np.testing.assert_allclose(past.laws[-1].mean / u, now.mean / u, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(np.sqrt(past.laws[-1].covariance.diagonal()) / u, 1.0, rtol=2e-3)
+    if fixed:
+        Q = np.array([law.mean[9:] for law in past.laws])
+        assert np.abs(Q - Q_TRUE).max() < 4.0 * u[9:].max()
+
+
+def test_without_windows_there_is_none() -> None:
+    past = State(MEAN, U, Priors(), STILL, TemperatureModel(), fixed=False).past()
+    assert isinstance(past, Past)
+    assert len(past.days) == 0
+    assert not past.knows(0.0)

@@ -1,0 +1,213 @@
+"""`fieldcal show --past` and `fieldcal export --corrected`: the same past in all forms, and what has none."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agent.cli.main import run_cli
+from agent.core.memory import Memory
+from agent.core.snapshot import pack, unpack
+from agent.delivery.history import FILE_NAME, History
+from agent.delivery.schema import write_memory
+from agent.delivery.store import Store
+from calib.model import PARAMETERS
+from tests.unit.recorded_bench import EPOCH_NS, record
+
+RECORDING = "fieldcal-000001.mcap"
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bench for 80 s: four windows."""
+    directory = tmp_path_factory.mktemp("past")
+    record(directory, 80.0)
+    return directory
+
+
+@pytest.fixture
+def copied(kept: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(kept, tmp_path / "data")
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
+    status = run_cli([*map(str, arguments)])
+    told = capsys.readouterr()
+    return status, told.out, told.err
+
+
+def shown(capsys: pytest.CaptureFixture[str], directory: Path) -> dict[str, Any]:
+    status, out, err = run(capsys, "show", "--past", "--data-dir", directory, "--json", "-")
+    assert (status, err) == (0, "")
+    (past,) = json.loads(out)["past"]
+    return dict(past)
+
+
+def change_memory(directory: Path, change: Any) -> None:
+    """Replace the kept state by what `change` makes of its bytes."""
+    with History(directory / FILE_NAME) as history:
+        (memory,) = history.memories()
+    with sqlite3.connect(directory / FILE_NAME) as connection:
+        state = change(memory.state)
+        write_memory(connection, Memory(memory.sensor, memory.identity, memory.sequence, state))
+
+
+def test_table_csv_and_json_say_the_same(kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    past, to = shown(capsys, kept), tmp_path / "past.csv"
+    assert run(capsys, "show", "--past", "--data-dir", kept, "--csv", to)[0] == 0
+    head, *rows = csv.reader(line for line in to.read_text().splitlines() if not line.startswith("#"))
+    assert past["smoothing"] in to.read_text()
+    table = run(capsys, "show", "--past", "--data-dir", kept)[1].splitlines()
+    assert len(rows) == len(past["epochs"]) == past["windows"] == 4
+    for row, epoch, line in zip(rows, past["epochs"], table[3:], strict=True):
+        told = dict(zip(head, row, strict=True))
+        values = [*np.ravel(epoch["sensitivity"]), *epoch["offset"]]
+        assert [float(told[name]) for name in PARAMETERS] == values
+        assert [float(told[f"u_{name}"]) for name in PARAMETERS] == epoch["standard_uncertainty"]
+        np.testing.assert_allclose(np.diag(epoch["covariance"]), np.square(epoch["standard_uncertainty"]), rtol=1e-12)
+        assert line.startswith(told["time"])
+        U = past["coverage_factor"] * epoch["standard_uncertainty"][0]
+        assert f"{values[0]:.0f} ± {U:.0f}" in line
+    # An epoch is the end of a window. Its own calibration comes into force 1.5 s later, when the window closes.
+    results = json.loads(run(capsys, "show", "--data-dir", kept, "--json", "-")[1])["sensors"]["mems"]
+    newest, third = results["history"]
+    assert newest["t_utc_ns"] - past["epochs"][3]["t_utc_ns"] == pytest.approx(1.5e9, abs=1e7)
+    numbers = [epoch["calibration"] and epoch["calibration"]["sequence"] for epoch in past["epochs"]]
+    assert numbers == [None, None, None, third["sequence"]]
+    stops = [EPOCH_NS + 1e9 * window["stop_s"] for window in reversed(results["windows"])]
+    np.testing.assert_allclose([epoch["t_utc_ns"] for epoch in past["epochs"]], stops, rtol=0, atol=1e6)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_samples_are_corrected_by_the_past_and_name_their_calibration(
+    ending: str, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if ending == "parquet":
+        pytest.importorskip("pyarrow", reason="the extra files is not installed")
+    past, to, again = shown(capsys, kept), tmp_path / f"a.{ending}", tmp_path / f"b.{ending}"
+    for path in (to, again):
+        assert run(capsys, "export", "--corrected", kept / RECORDING, "-o", path)[::2] == (0, "")
+    assert to.read_bytes() == again.read_bytes()
+    if ending == "csv":
+        head, *lines = [line for line in to.read_text().splitlines() if not line.startswith("#")]
+        columns = dict(zip(head.split(","), np.loadtxt(lines, delimiter=",").T, strict=True))
+        about = to.read_text()
+    else:
+        from pyarrow import parquet
+
+        table = parquet.read_table(to)
+        columns = {name: table[name].to_numpy() for name in table.column_names}
+        columns["time_s"] = columns["time"].astype(np.int64) * 1e-9
+        about = str(table.schema.metadata)
+    assert past["smoothing"].split(", state ")[0] in about
+    V, a = (np.column_stack([columns[f"{kind}{axis}"] for axis in "xyz"]) for kind in "va")
+    ends = [epoch["t_utc_ns"] * 1e-9 for epoch in past["epochs"]]
+    values = np.array([[*np.ravel(epoch["sensitivity"]), *epoch["offset"]] for epoch in past["epochs"]])
+    at = np.column_stack([np.interp(columns["time_s"], ends, column) for column in values.T])
+    ideal = np.einsum("nij,nj->ni", at[:, :9].reshape(-1, 3, 3), a) + at[:, 9:]
+    np.testing.assert_allclose(ideal, V, rtol=0, atol=1e-3)  # counts; S by 1e-6 u of itself
+    results = json.loads(run(capsys, "show", "--data-dir", kept, "--json", "-")[1])["sensors"]["mems"]
+    found = {(update["t_utc_ns"] - EPOCH_NS) * 1e-9: update["sequence"] for update in results["history"]}
+    begins = columns["time_s"][columns["calibration"] > 0][0] - EPOCH_NS * 1e-9
+    assert begins == pytest.approx(min(found), abs=1.0)  # from the next block on
+    assert set(columns["calibration"].tolist()) == {0, *found.values()}
+
+
+def test_the_kept_state_tells_the_past_beside_a_running_agent(
+    kept: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = Store(copied, 0)
+    try:
+        assert shown(capsys, copied) == shown(capsys, kept)
+        to = tmp_path / "a.csv"
+        asked = "export", "--corrected", kept / RECORDING, "-o", to, "--data-dir", copied
+        assert run(capsys, *asked)[::2] == (0, "")
+        assert shown(capsys, kept)["state_sha256"] in to.read_text()
+    finally:
+        store.close()
+
+
+def test_a_store_without_a_state_and_a_state_of_an_earlier_version_are_told(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Store(tmp_path / "new", 0).close()
+    assert run(capsys, "show", "--past", "--data-dir", tmp_path / "new") == (
+        0, f"{tmp_path / 'new'}: no state is kept yet\n", ""
+    )  # fmt: skip
+    to = tmp_path / "a.csv"
+    asked = "export", "--corrected", copied / RECORDING, "-o", to, "--data-dir"
+    status, _, err = run(capsys, *asked, tmp_path / "new")
+    assert status == 2
+    assert "no sample can be corrected: no state is kept of the device virtual mems-1" in err
+
+    def older(state: bytes) -> bytes:
+        held = unpack(state)
+        del held["channel"]
+        return pack(held)
+
+    change_memory(copied, older)
+    status, out, _ = run(capsys, "show", "--past", "--data-dir", copied)
+    assert status == 0
+    assert "no past of virtual mems-1" in out
+    assert "its state is of an earlier version" in out
+    status, _, err = run(capsys, *asked, copied)
+    assert status == 2
+    assert "its state is of an earlier version" in err
+    assert not to.exists()
+
+
+@pytest.mark.parametrize("damage", ["bytes", "content", "page"])
+def test_a_damaged_state_is_one_line(damage: str, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if damage == "bytes":
+        with sqlite3.connect(copied / FILE_NAME) as connection:
+            connection.execute("UPDATE memory SET state = zeroblob(100)")
+    elif damage == "content":
+        change_memory(copied, lambda _: pack({"estimation": {"state": {"records": 5}}, "channel": "{}", "filters": {}}))
+    else:
+        data = bytearray((copied / FILE_NAME).read_bytes())
+        data[len(data) // 2 :] = b"\xa5" * (len(data) - len(data) // 2)
+        (copied / FILE_NAME).write_bytes(data)
+    status, out, err = run(capsys, "show", "--past", "--data-dir", copied)
+    if damage == "content":
+        assert (status, err) == (0, "")
+        assert "its state cannot be read" in out
+    else:
+        assert (status, out) == (2, "")
+        assert err.startswith("fieldcal show: ")
+    assert (out + err).count("\n") == 1
+
+
+def test_a_recording_that_a_power_cut_tore_is_exported_up_to_there(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = (copied / RECORDING).read_bytes()
+    (copied / RECORDING).write_bytes(data[: int(0.9 * len(data))])
+    to = tmp_path / "a.csv"
+    status, _, err = run(capsys, "export", "--corrected", copied / RECORDING, "-o", to)
+    assert status == 0
+    assert "ends early" in err
+    assert "nan" not in to.read_text().splitlines()[-1]
+
+
+def test_what_cannot_be_corrected_is_refused_with_a_remedy(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    to = tmp_path / "a.csv"
+    for arguments, words in (
+        (["-o", tmp_path / "a.wav"], "--corrected writes one file with the ending .csv or .parquet"),
+        (["-o", to, "--device", "reference"], "reference has 1 axis; S and Q are those of three axes"),
+        (["-o", to, "--device", "other"], "has no samples of 'other'"),
+    ):
+        status, _, err = run(capsys, "export", "--corrected", kept / RECORDING, *arguments)
+        assert (status, to.exists()) == (2, False)
+        assert words in err
+    status, _, err = run(capsys, "export", kept / RECORDING, "-o", to, "--data-dir", kept)
+    assert status == 2
+    assert "--data-dir names the windows for --corrected" in err
