@@ -16,15 +16,15 @@ import numpy as np
 from calib.distributions import coverage_factor
 from calib.estimate.budget import Budget, budget
 from calib.estimate.condense import Condensed, condense, effective
-from calib.estimate.determined import determined
+from calib.estimate.determined import Flags, determined
 from calib.estimate.equations import Equations
-from calib.estimate.gauss_newton import Flags, Solution, slope_residuals, solve
 from calib.estimate.never_turned import mean_input, never_turned
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare, share_after
 from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
 from calib.estimate.slope_scatter import SlopeScatter, estimated
+from calib.estimate.solution import Solution, slope_residuals, solve
 from calib.estimate.verdict import misfit, nothing_determined, nuisance_pull, reasons, turned_windows
 from calib.excitation.bands import motion_band_hz
 from calib.excitation.excited import excited_together

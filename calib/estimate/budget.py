@@ -14,8 +14,8 @@ import numpy as np
 
 from calib.estimate.banded import Banded
 from calib.estimate.deviations import BetweenBands
-from calib.estimate.gauss_newton import Solution, slope_residuals
 from calib.estimate.scatter import between_windows
+from calib.estimate.solution import Solution, slope_residuals
 from calib.model import Array
 
 

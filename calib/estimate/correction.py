@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.estimate.gauss_newton import Flags
+from calib.estimate.determined import Flags
 from calib.model import Array, Calibration
 
 

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from calib.distributions import coverage_factor
-from calib.estimate.chain import Link, Passage, backward, forward, passed, returned, solved
+from calib.estimate.chain import Link, Passage, passed, returned, solved
+from calib.estimate.gauss_newton import Lines, gauss_newton
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.physics import SIZE, STEP, Stack, Windows
 from calib.estimate.quantities import KINDS, LAG, RESPONSE, Quantity
@@ -32,10 +33,6 @@ from calib.estimate.unknowns import Unknown, Unknowns
 from calib.model import Array
 from calib.signal.order_statistics import distinct
 
-MOST_PASSES = 30
-CONVERGED = 1e-6  # standard uncertainties. The passes shrink a step a hundred times, so that the next is 1e-8
-MOST_HALVINGS = 8
-ROUNDING = 1e-9  # of chi-squared: a smaller increase is a rounding error
 Seen = tuple[float, float]  # the lowest and highest temperature in degC of a window; NaN before any had one
 
 
@@ -295,7 +292,10 @@ class _Solution:
         self.passages = [unknowns.passage(a, b) for a, b in zip(days.tolist(), days.tolist()[1:], strict=False)]
         self.mean, self.u = unknowns.prior
         self._segments = self._between_steps()
-        self._rows = self._made(self.mean)
+        self._rows, self.by_record = self._made(self.mean), list[Array]()
+        # What a window without a temperature weighs depends on how Q changes with temperature.
+        untold = any(not np.isfinite(r.temperature_degc) for r in records)
+        self.unsure = bool(untold and np.isfinite(seen_degc).all())
 
     def _made(self, x: Array) -> Rows:
         degrees = Degrees.of(self.unknowns, self.seen_degc, x)
@@ -337,54 +337,18 @@ class _Solution:
             x.append(follows @ x[-1] + shift)
         return np.array(x)
 
-    def lines(self, x: Array) -> tuple[list[Array], list[Array], float]:
-        """Rows by record and by epoch at x (K, N), and the sum of their squares with those of the priors."""
-        around = self.around(x)
-        rows = self._rows.at(x[self.epoch_of], around[self.epoch_of]) if self.records else []
-        size = len(self.unknowns)
+    def lines_at(self, x: Array) -> Lines:
+        """All lines at x (K, N); the rows of each record are then in `by_record`."""
+        if self.unsure:
+            self._rows = self._made(x[-1])
+        around, size = self.around(x), len(self.unknowns)
+        self.by_record = self._rows.at(x[self.epoch_of], around[self.epoch_of]) if self.records else []
         by_epoch: list[list[Array]] = [[np.zeros((0, size + 1))] for _ in self.days]
-        for own, k in zip(rows, self.epoch_of.tolist(), strict=True):
+        for own, k in zip(self.by_record, self.epoch_of.tolist(), strict=True):
             by_epoch[k].append(own)
         for stated in self.unknowns.statements.dated:
             k = int(np.searchsorted(self.days, stated.day))
             by_epoch[k].append(self.unknowns.dated(stated, x[k]))
-        stacked = [np.vstack(parts) for parts in by_epoch]
-        pull = (self.mean - x[0]) / self.u
-        chi2 = float(pull @ pull + sum(float(own[:, -1] @ own[:, -1]) for own in stacked))
-        return rows, stacked, chi2
-
-    def solved(self, start: Now | None) -> Estimate:
-        """Passes until no unknown moves by more than CONVERGED; halved where chi-squared would grow."""
-        x, walked, best, least = self.begun(start), 0.0, None, np.inf
-        unsure = any(not np.isfinite(r.temperature_degc) for r in self.records) and np.isfinite(self.seen_degc).all()
-        for passes in range(1, MOST_PASSES + 1):
-            rows, stacked, chi2 = self.lines(x)
-            for _ in range(MOST_HALVINGS):
-                if best is None or chi2 + walked <= least * (1.0 + ROUNDING) + ROUNDING:
-                    break
-                x, walked = 0.5 * (x + best[0]), 0.5 * (walked + best[1])
-                rows, stacked, chi2 = self.lines(x)
-            best, least = (x, walked), chi2 + walked
-            if start is not None and passes == 1:
-                best = None  # its values do not follow from one epoch to the next
-            root, links = self._forward(x, stacked)
-            back = backward(root, links)
-            _, factor = solved(root)
-            small = np.abs(back).max(axis=0) <= CONVERGED * np.linalg.norm(factor, axis=1)
-            if small.all():
-                break
-            x = x + back
-            walked = _squares(links, back)
-            if unsure:
-                self._rows = self._made(x[-1])
-                best = None
-        return Estimate(
-            self.unknowns, self.records, self.noise, self.seen_degc, self.days, self.epoch_of, x, self.around(x), root,
-            links, rows, least, passes,
-        )  # fmt: skip
-
-    def _forward(self, x: Array, stacked: Sequence[Array]) -> tuple[Array, list[Link]]:
-        size = len(self.unknowns)
         root = np.zeros((size, size + 1))
         root[range(size), range(size)] = 1.0 / self.u
         root[:, -1] = (self.mean - x[0]) / self.u
@@ -392,10 +356,12 @@ class _Solution:
             replace(passage, gap=follows @ before + shift - after)
             for (follows, shift, passage), before, after in zip(self.passages, x, x[1:], strict=False)
         ]
-        return forward(root, stacked, passages)
+        return Lines(root, [np.vstack(parts) for parts in by_epoch], passages)
 
-
-def _squares(links: Sequence[Link], back: Array) -> float:
-    """The sum of squares of what walks and steps have moved."""
-    moved = (np.linalg.solve(link.own, link.z - link.next @ d) for link, d in zip(links, back[1:], strict=True))
-    return float(sum(float(w @ w) for w in moved))
+    def solved(self, start: Now | None) -> Estimate:
+        """The estimate, from the passes of Gauss-Newton."""
+        found = gauss_newton(self.lines_at, self.begun(start), follows=start is None, alike=not self.unsure)
+        return Estimate(
+            self.unknowns, self.records, self.noise, self.seen_degc, self.days, self.epoch_of, found.x,
+            self.around(found.x), found.root, found.links, self.by_record, found.chi2, found.passes,
+        )  # fmt: skip

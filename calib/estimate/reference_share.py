@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from calib.estimate.estimate import Now
-from calib.estimate.gauss_newton import Solution
 from calib.estimate.quantities import REFERENCE, REFERENCE_CORNER, REFERENCE_DRIFT
+from calib.estimate.solution import Solution
 from calib.estimate.unknowns import EXACT
 from calib.model import Array
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.distributions import chi2_quantile
-from calib.estimate.gauss_newton import Solution
+from calib.estimate.solution import Solution
 from calib.model import Array
 
 # No scatter of the slopes is stated. It counts only if noise alone would show as much once in a hundred recordings.

@@ -15,9 +15,8 @@ from typing import Any, Self
 import numpy as np
 
 from calib.estimate.correction import Law
-from calib.estimate.determined import determined
+from calib.estimate.determined import Flags, determined
 from calib.estimate.estimate import Estimate, Now, Then, estimate
-from calib.estimate.gauss_newton import Flags
 from calib.estimate.innovation import Innovation
 from calib.estimate.never_turned import never_turned
 from calib.estimate.nuisances import Priors

@@ -10,9 +10,10 @@ import numpy as np
 from calib.distributions import chi2_quantile, coverage_factor
 from calib.estimate.axes import LEAST_S, sensitivity_reasons, where_nothing_moved
 from calib.estimate.budget import Budget
-from calib.estimate.gauss_newton import Flags, Solution
+from calib.estimate.determined import Flags
 from calib.estimate.mistakes import FACTORS, of_a_prior, of_means, with_unit
 from calib.estimate.quantities import LAG
+from calib.estimate.solution import Solution
 from calib.model import PARAMETERS, Array, Calibration, Window
 
 CONTRADICTED = 0.999  # probability: one sound calibration in a thousand is refused as a contradiction of its priors
