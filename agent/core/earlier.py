@@ -1,8 +1,8 @@
-"""Snapshots of versions before 8, in which a recursion held S and Q.
+"""Snapshots of versions before 9: until 7 a recursion held S and Q, records of version 8 hold less.
 
-Its posterior cannot become records of windows. So the calibration in force is left of an estimation, from which the
-estimate begins as after a rollback. Samples, clocks, positions, devices and the numbering of the results go on. From
-version 8 on a snapshot holds records and statements, which a changed estimator solves anew.
+The calibration in force is left of an estimation, from which the estimate begins as after a rollback. Samples, clocks,
+positions, devices and the numbering of the results go on. From version 9 on a snapshot holds records and statements,
+which a changed estimator solves anew.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ from calib.excitation.standing import USUAL
 
 
 def brought_up(version: int, state: dict[str, Any]) -> None:
-    """Change what a pipeline of this version wrote, or what it kept of a device, to what version 8 writes.
+    """Change what a pipeline of this version wrote, or what it kept of a device, to what version 9 writes.
 
     Raises KeyError or TypeError where a part is missing.
     """
-    for older in range(version, 8):
+    for older in range(version, 9):
         if older in CHANGES:
             CHANGES[older](state)
     for holder in [state, *state.get("channels", {}).values()]:
-        if held := holder.get("estimation"):
+        held = holder.get("estimation")
+        if held and held.get("state", True) is not None:
+            day = held["recursion"]["day"] if version < 8 else held["state"]["now"]["day"]
             holder["estimation"] = {
-                "state": None, "day": held["recursion"]["day"], "gate": held["gate"], "in_force": held["in_force"],
+                "state": None, "day": day, "gate": held["gate"], "in_force": held["in_force"],
             }  # fmt: skip
 
 

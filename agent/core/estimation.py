@@ -374,7 +374,7 @@ class Estimation:
 
     def load(self, state: dict[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
-        if state["state"] is None:  # of a version before 8
+        if state["state"] is None:  # of a version before 9
             self.gate.load(state["gate"])
             self.roll_back(Calibration(**state["in_force"]), state["day"])
             return

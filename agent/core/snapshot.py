@@ -9,7 +9,7 @@ import numpy as np
 
 from agent.core.earlier import brought_up
 
-VERSION = 8
+VERSION = 9
 _ARRAY = 1  # msgpack extension code for a numpy array
 
 
@@ -22,7 +22,7 @@ def pack(state: dict[str, Any]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, Any]:
-    """The state in the bytes of `pack`. Of a version before 8, what agent.core.earlier leaves of it.
+    """The state in the bytes of `pack`. Of a version before 9, what agent.core.earlier leaves of it.
 
     Raises ValueError if the bytes are no snapshot, or if this program does not know their version.
     """

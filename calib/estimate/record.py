@@ -16,7 +16,6 @@ import numpy as np
 from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.never_turned import mean_input
-from calib.estimate.type_a import FEWEST_FREEDOM
 from calib.excitation.bands import motion_band_hz
 from calib.excitation.excited import Motion, excited, excited_together, excited_ways, motion_of
 from calib.model import Array, Pose, Window
@@ -42,7 +41,7 @@ class Record:
     silent channels share (calib.excitation.excited). `root` R (2M, 2M), `slopes` R b (2M, 3): the regression of V on
     [u, du/dt], as calib.estimate.condense gives it; `passed` R P (TERMS, 2M, M): what each term of the response adds.
     `omega2`, `each_omega2`: power of du/dt over that of u in rad2/s2. `noise` (3,): SD of the residuals of a point.
-    `ratio` (2,): variance of slopes and of means over that of white noise, with `freedom` degrees of freedom.
+    `scores` (2, LEVELS, SUMS): what tells how much slopes and means scatter (calib.estimate.type_a.score_sums).
 
     Means: of the reference `mean_x` (2M,), of V `means` (k, 3), each a sum over (1, T, T^2) with the weights `over_t`
     (k, 3), T in K above 0 degC; one row for one window. `temperature_degc`: NaN where nothing told it. `held_mps2`
@@ -72,8 +71,7 @@ class Record:
     passed: Array
     omega2: float
     noise: Array
-    ratio: Array
-    freedom: float
+    scores: Array
     mean_x: Array
     means: Array
     over_t: Array
@@ -107,12 +105,7 @@ class Record:
         if motion_hz is not None and to_hz == np.inf:
             to_hz = WIDER * motion_hz[1]
         data = condense([found], response_hz=to_hz, one_frequency=motion_hz is None)
-        channels, type_a = data.channels, data.type_a
-        live = np.repeat(np.diag(data.root[0]) > 0.0, 3)
-        freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
-        # Where segments are few, the rest is what a filter makes of white noise.
-        own = min(freedom / FEWEST_FREEDOM, 1.0)
-        ratio = np.array([type_a.slope_ratio(live) if live.any() else 1.0, np.diag(type_a.means).mean()])
+        channels = data.channels
         passed, told = np.zeros((TERMS, 2 * channels, channels)), np.zeros((0, TERMS + 1))
         deviations, left_open = Deviations(), LeftOpen()
         if (bands := data.bands) is not None:
@@ -130,8 +123,8 @@ class Record:
             window.independent, np.round(directions @ directions.T, 6) + 0.0,
             np.eye(channels) if found.pose.along is None else found.pose.along,
             np.zeros((channels, channels)) if found.pose.along_rate_s is None else found.pose.along_rate_s,
-            data.root[0], data.slopes[0], passed, float(data.omega2[0]), type_a.noise[0], own * ratio + 1.0 - own,
-            freedom, data.mean_x[0], data.mean_v[0][None], np.array([[1.0, t, t * t]]), temperature_degc,
+            data.root[0], data.slopes[0], passed, float(data.omega2[0]), data.type_a.noise[0], data.type_a.scores,
+            data.mean_x[0], data.mean_v[0][None], np.array([[1.0, t, t * t]]), temperature_degc,
             mean_input(window), float(data.count[0]), told, deviations, left_open,
             motion_hz, mean_frequency_hz(data), motion=motion_of(window) if found.turned else None,
         )  # fmt: skip

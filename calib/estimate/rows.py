@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -12,38 +13,54 @@ from calib.estimate.physics import Stack, Windows
 from calib.estimate.quantities import offset_temperature
 from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
-from calib.estimate.type_a import LEAST_INFLATION
+from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
 from calib.estimate.unknowns import Unknowns
 from calib.model import Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class Noise:
-    """Variance of slopes and of means over that of white noise, pooled over windows by their degrees of freedom."""
+    """How much slopes and means scatter, by all windows: `scores` (2, LEVELS, SUMS) (calib.estimate.type_a).
 
-    slopes: float = 1.0
-    means: float = 1.0
-    degrees_of_freedom: float = 0.0
+    Where segments are few, the rest is what a filter makes of white noise.
+    """
+
+    scores: Array = field(default_factory=lambda: np.zeros((2, LEVELS, SUMS)))
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> Noise:
-        """That of all records: their order does not matter."""
-        found = cls()
-        for record in records:
-            found = found.pooled(record)
-        return found
+        """That of all records."""
+        return cls(np.sum([record.scores for record in records], axis=0)) if records else cls()
 
     def pooled(self, record: Record) -> Noise:
         """With one more record."""
-        total = self.degrees_of_freedom + record.freedom
-        if total <= 0.0:
-            return self
-        share = record.freedom / total
-        slopes, means = (
-            (1.0 - share) * mine + share * its
-            for mine, its in zip((self.slopes, self.means), record.ratio.tolist(), strict=True)
-        )
-        return Noise(slopes, means, total)
+        return Noise(self.scores + record.scores)
+
+    @cached_property
+    def _found(self) -> tuple[Scattered | None, Scattered | None]:
+        return scattered(self.scores[0]), scattered(self.scores[1])
+
+    @property
+    def slopes(self) -> float:
+        """Variance of slopes over that of white noise."""
+        return _beside_white(self._found[0])
+
+    @property
+    def means(self) -> float:
+        """Variance of means over that of white noise."""
+        return _beside_white(self._found[1])
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the one that is known from less; 0 where none is known."""
+        return min((found.degrees_of_freedom for found in self._found if found is not None), default=0.0)
+
+
+def _beside_white(found: Scattered | None) -> float:
+    if found is None:
+        return 1.0
+    own = min(found.degrees_of_freedom / FEWEST_FREEDOM, 1.0)
+    return own * found.variance + 1.0 - own
 
 
 @dataclass(frozen=True, slots=True)

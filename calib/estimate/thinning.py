@@ -62,8 +62,6 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
     moved = [r.means - np.outer(r.over_t[:, 0], nominal @ D @ (r.mean_x - mean_x)[: D.shape[1]]) for r in records]
     over = _triangle(np.hstack([np.vstack([r.over_t for r in records]), np.vstack(moved)]), 3)
     power = np.array([(r.root[:, : r.channels] ** 2).sum() for r in records]) + np.finfo(float).tiny
-    freedom = np.array([r.freedom for r in records])
-    by = freedom / freedom.sum() if freedom.sum() else share
     deviations, left_open = Deviations(), LeftOpen()
     motions = [r.motion for r in records if r.motion is not None]
     for r in records:
@@ -76,7 +74,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
         independent=float(share @ [r.independent for r in records]), along=mean("along"),
         along_rate_s=mean("along_rate_s"), root=root, slopes=slopes, passed=passed,
         omega2=float(power @ [r.omega2 for r in records] / power.sum()), noise=noise,
-        ratio=np.asarray(sum(w * r.ratio for w, r in zip(by, records, strict=True))), freedom=float(freedom.sum()),
+        scores=np.asarray(sum(r.scores for r in records)),
         mean_x=mean_x, means=over[:, 3:], over_t=over[:, :3],
         temperature_degc=float(share @ [r.temperature_degc for r in records]), held_mps2=mean("held_mps2"),
         count=float(sum(r.count for r in records)), told=_triangle(np.vstack([r.told for r in records]), TOLD),

@@ -22,6 +22,10 @@ Index = NDArray[np.intp]
 RHO_COARSEN = 0.35
 FEWEST_FREEDOM = 10.0  # degrees of freedom: from fewer, a mean of squares is off by 40 % and more
 LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
+LEVELS = 6  # segments are joined in pairs so often at most: half a second becomes sixteen
+FEWEST_SEGMENTS = 4.0  # of a window, on average, that are still joined
+SINGULAR = 1e-9
+SUMS = 10  # numbers for each level, see `score_sums`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,12 +56,14 @@ class TypeA:
     `noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
     `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were what a filter makes of
     white noise, independent between axes. `degrees_of_freedom` of both, inf where single segments allow no estimate.
+    `scores` (2, LEVELS, SUMS): the sums of both from which this follows.
     """
 
     noise: Array
     slopes: Array
     means: Array
     degrees_of_freedom: float
+    scores: Array
 
     def slope_ratio(self, live: Flags) -> float:
         """Variance of the slopes over that of white noise, mean over those with data (`live`, 6M)."""
@@ -94,9 +100,9 @@ def pooled(
         score = (part.total[..., -3:] - part.total[..., :-3] @ beta) / unit
         mean_scores.append(score / np.sqrt(part.count.sum(1))[:, None, None])
     live = np.repeat(np.any([np.any(np.diagonal(r, axis1=1, axis2=2) > 0.0, axis=0) for r in roots], axis=0), 3)
-    slope_cov, slope_dof = _scatter(slope_scores, live)
-    mean_cov, mean_dof = _scatter(mean_scores, np.ones(3, dtype=bool))
-    return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof))
+    slope_cov, slope_dof, of_slopes = _scatter(slope_scores, live)
+    mean_cov, mean_dof, of_means = _scatter(mean_scores, np.ones(3, dtype=bool))
+    return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof), np.array([of_slopes, of_means]))
 
 
 def _noise(part: Segments, slopes: Array, root: Array) -> Array:
@@ -111,55 +117,82 @@ def _noise(part: Segments, slopes: Array, root: Array) -> Array:
     return np.asarray(np.maximum(spread, np.where(floor > 0.0, floor, 1.0)[:, None]))
 
 
-def _scatter(scores: list[Array], live: Flags) -> tuple[Array, float]:
-    """Covariance (D, D) of a window's summed scores and its degrees of freedom; `live` (D,) are those with data.
+def _scatter(scores: list[Array], live: Flags) -> tuple[Array, float, Array]:
+    """Covariance (D, D) of a window's summed scores, its degrees of freedom, and `score_sums`; `live` (D,) are those
+    with data.
 
     `scores` (W, K, D) of windows with K segments each.
     """
-    windows, segments = np.array([s.shape[:2] for s in scores], dtype=float).T
-    freedom = float(windows @ (segments - 1.0))
-    if freedom < 1 or not live.any():
-        return np.eye(len(live)), np.inf
-    covariance = np.sum([s.shape[1] * _flat(s).T @ _flat(s) for s in scores], axis=0) / freedom
-    gamma0, gamma1 = _neighbours([s[..., live] for s in scores])
-    if gamma0 <= 0.0:
-        return covariance, freedom
-    rho = gamma1 / gamma0
-    if rho > RHO_COARSEN and segments.max() >= 4:
-        return _scatter([_paired(s) for s in scores], live)
-    if rho <= 1.0 / np.sqrt(freedom * live.sum()):  # within its own SD of none at all
-        return covariance, freedom
-    typical = float(windows @ segments / windows.sum())
-    naive = gamma0 - 2.0 * gamma1 / typical  # what the covariance above expects, neighbours being correlated
-    inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
-    return covariance * inflation, freedom / (1.0 + 0.5 * inflation)  # rho itself is known from as little
+    sums = score_sums([s[..., live] for s in scores])
+    found = scattered(sums)
+    if found is None:
+        return np.eye(len(live)), np.inf, sums
+    for _ in range(found.level):
+        scores = [_paired(s) for s in scores]
+    covariance = np.sum([s.shape[1] * _flat(s).T @ _flat(s) for s in scores], axis=0) / sums[found.level, 0]
+    return covariance * found.inflation, found.degrees_of_freedom, sums
+
+
+@dataclass(frozen=True, slots=True)
+class Scattered:
+    """How much scores scatter: the `variance` of a window's sum of them, over that of white noise, of segments joined
+    `level` times; it has the `inflation` by which neighbours that correlate make it larger."""
+
+    level: int
+    variance: float
+    inflation: float
+    degrees_of_freedom: float
+
+
+def score_sums(scores: Sequence[Array]) -> Array:
+    """(LEVELS, SUMS) what scores (W, K, D) of windows tell of their scatter. Those of other windows add to them.
+
+    For segments as they are, and joined in pairs once, twice, ...: degrees of freedom, windows, segments, W D, and the
+    mean square of a sum of scores; of windows with three segments and more also what a score's variance and the
+    covariance of two neighbours contribute to the last two numbers, the sums of squares and of products of neighbours.
+    """
+    found = np.zeros((LEVELS, SUMS))
+    for own in found:
+        for s in scores:
+            w, k, d = s.shape
+            square = k * float(np.vdot(s, s)) / max(d, 1)
+            own[:5] += w * (k - 1.0), w, w * k, w * d, square
+            if k > 2:
+                # With r = g - mean(g), E sum r_k^2 and E sum r_k r_k+1 are linear in both.
+                neighbours = (k - 1.0) * (1.0 - 2.0 * (k + 1.0) / k**2) + 2.0 / k
+                product = k * float(np.vdot(s[:, 1:], s[:, :-1])) / max(d, 1)
+                own[5:] += w * (k - 1.0), w * (k - 1.0) / k, w * neighbours, square, product
+        scores = [_paired(s) for s in scores]
+    return found
+
+
+def scattered(sums: Array) -> Scattered | None:
+    """What `score_sums` (LEVELS, SUMS) say; None where single segments allow no estimate."""
+    for level, (freedom, windows, segments, dimensions, total, own, ends, neighbours, square, product) in enumerate(
+        sums.tolist()
+    ):
+        if freedom < 1.0 or not dimensions:
+            return None
+        variance, matrix = total / freedom, np.array([[own, -2.0 * ends], [-ends, neighbours]])
+        if abs(np.linalg.det(matrix)) < SINGULAR:
+            return Scattered(level, variance, 1.0, freedom)
+        gamma0, gamma1 = np.linalg.solve(matrix, [square, product]).tolist()
+        if gamma0 <= 0.0:
+            return Scattered(level, variance, 1.0, freedom)
+        rho, typical = gamma1 / gamma0, segments / windows
+        if rho > RHO_COARSEN and typical >= FEWEST_SEGMENTS and level + 1 < len(sums):
+            continue
+        if rho <= 1.0 / np.sqrt(freedom * dimensions / windows):  # within its own SD of none at all
+            return Scattered(level, variance, 1.0, freedom)
+        naive = gamma0 - 2.0 * gamma1 / typical  # what the variance above expects, neighbours being correlated
+        inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
+        # rho itself is known from as little
+        return Scattered(level, variance * inflation, inflation, freedom / (1.0 + 0.5 * inflation))
+    raise AssertionError("the last level is never joined again")
 
 
 def _flat(scores: Array) -> Array:
     return scores.reshape(-1, scores.shape[-1])
-
-
-def _neighbours(scores: list[Array]) -> tuple[float, float]:
-    """Variance of a score and covariance of two neighbours, unbiased though each window's scores sum to zero.
-
-    With K scores g and r = g - mean(g): E sum r_k^2 and E sum r_k r_{k+1} are linear in both; solved over all windows.
-    """
-    scores = [s for s in scores if s.shape[1] > 2]
-    windows, k = np.array([s.shape[:2] for s in scores], dtype=float).reshape(-1, 2).T
-    none, mean_square = np.zeros_like(k), np.array([k, 2.0 * (k - 1.0)]) / k**2  # of mean(g), by gamma0, gamma1
-    matrix = np.array(
-        [
-            (windows * (np.array([k, none]) - k * mean_square)).sum(axis=1),
-            (windows * (np.array([none, k - 1.0]) - (k + 1.0) * mean_square + 2.0 / k)).sum(axis=1),
-        ]
-    )
-    own = sum(s.shape[1] * float(np.vdot(s, s)) for s in scores)
-    next_to = sum(s.shape[1] * float(np.vdot(s[:, 1:], s[:, :-1])) for s in scores)
-    observed = np.array([own, next_to]) / max(scores[0].shape[2] if scores else 1, 1)
-    if abs(np.linalg.det(matrix)) < 1e-9:
-        return 0.0, 0.0
-    gamma0, gamma1 = np.linalg.solve(matrix, observed)
-    return float(gamma0), float(gamma1)
 
 
 def _paired(scores: Array) -> Array:

@@ -60,6 +60,8 @@ REVISIONS = (
     Revision(10, "b98989ace301", "0.2.0"),
     # The last without a name. Engine 11 gives the same results, and its name in them.
     Revision(11, "46e5f60074dd", "0.2.0"),
+    # The last before noise is pooled as sums over windows.
+    Revision(12, "f21d15057af9", "0.2.0"),
 )
 
 

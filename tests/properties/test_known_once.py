@@ -52,7 +52,7 @@ class Life:
         random = np.random.default_rng([self.seed, self.hour])
         made = building_window(random, level_mps2=(0.1, 0.1, 0.1), S=np.eye(3), Q=np.zeros(3), noise_mps2=1e-4)
         record = Record.of(made, self.hour * HOUR, reference=self.state.reference)
-        record = replace(record, freedom=0.0, ratio=np.ones(2))
+        record = replace(record, scores=np.zeros_like(record.scores))
         self.state.update(record)
         priors = Priors(self._values()).at_one_frequency(self.state.reference_frequency_hz, 0.0)
         none = Wander(dict.fromkeys(Wander.none().values, 0.0))

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from calib.estimate.adjustment import adjust
+from calib.estimate.condense import condense
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
 from calib.estimate.record import Record
+from calib.estimate.rows import Noise
 from calib.estimate.state import State
 from calib.estimate.statements import Statements, Step
 from calib.estimate.thinning import NEWEST, thinned
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.excitation.excited import excited
 from calib.model import Array
 from tests.building_windows import building_window
 from tests.clamp_windows import ALPHAS_DEG, S_TRUE, TRUTH, Faults, clamp_points
@@ -155,3 +158,17 @@ def test_a_direction_that_nothing_excites_learns_nothing_at_a_mount_that_never_t
     np.testing.assert_allclose(now.standard_uncertainty[[0, 8]], U[[0, 8]], rtol=1e-6)
     np.testing.assert_allclose(now.sensitivity[[0, 2], [0, 2]], 1.0, rtol=0, atol=1e-9)
     assert abs(now.sensitivity[1, 1] - TRUTH[4]) < 4.0 * now.standard_uncertainty[4] < 0.01
+
+
+def test_noise_that_correlates_is_pooled_over_windows_as_sums() -> None:
+    """AR(1) noise of 0.9 makes the variance of a mean (1 + 0.9) / (1 - 0.9) = 19 times that of white noise. One window
+    of 12 segments cannot tell how neighbours correlate: ratios of single windows gave 8.9, and 0.70 of u of S_zx."""
+    random = np.random.default_rng(5)
+    windows = clamp_points(random, Faults(0.003, 0.001, {}, 0.02, 4e-4, 0.02, 0.9), repetitions=12).windows
+    noise = Noise.of([Record.of(window, 0.0) for window in windows])
+    # By 160 degrees of freedom a variance is known to 11 %.
+    assert noise.means == pytest.approx(19.0, rel=0.3)
+    assert 100.0 < noise.degrees_of_freedom < 250.0
+    at_once = condense([excited(window) for window in windows]).type_a
+    assert noise.slopes == pytest.approx(at_once.slope_ratio(np.ones(6, dtype=bool)), rel=0.07)
+    assert noise.means == pytest.approx(float(np.diag(at_once.means).mean()), rel=0.07)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 
 from agent.config import Channel, parse_config
@@ -98,3 +99,17 @@ def test_a_field_that_the_earlier_version_did_not_have_counts_with_its_default()
     assert take_up(of_earlier("certificate", "u_lag_s"), DriverFilters(stated), None).reason.endswith(
         "in the state: certificate"
     )
+
+
+def test_of_version_8_the_calibration_in_force_is_left() -> None:
+    """Its records hold less than those of today; gate, devices and all beside the estimation go on."""
+    made_with = channel(UP, UPSIDE_DOWN)
+    state = unpack(state_of(made_with))
+    packed = msgspec.msgpack.decode(state_of(made_with)) | {"version": 8}
+    written = unpack(msgspec.msgpack.encode(packed))
+    assert written["estimation"].keys() == {"state", "day", "gate", "in_force"}
+    assert written["filters"] == state["filters"]
+    later = Estimation(made_with, None)
+    later.load(written["estimation"])
+    np.testing.assert_array_equal(later.in_force.sensitivity, state["estimation"]["in_force"]["sensitivity"])
+    assert later.state.windows == 0
