@@ -28,6 +28,7 @@ from calib.estimate.record import Record
 from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
 from calib.estimate.rows import Noise
+from calib.estimate.sources import Sources
 from calib.estimate.statements import DOUBT, Dated, Statements, Step
 from calib.estimate.thinning import thinned
 from calib.estimate.wander import TemperatureModel, Wander
@@ -294,6 +295,15 @@ class State:
         windows = [counts[day] for day in days]
         return Past(whole.days, laws[::-1], windows, changes[::-1], begin, self.coverage_factor)
 
+    def budget(self, whole: Estimate | None = None) -> Sources:
+        """What makes U of S and Q by a solution of the whole; None: it is solved anew."""
+        whole = whole or self.estimate()
+        now, by = whole.now, np.eye(12, len(whole.unknowns))
+        if (under_gravity := self._under_gravity(now)) is not None:
+            by[9:] -= under_gravity[1]
+        beside = self._over.budget(now, self.reference, self._priors[0], by)
+        return Sources.of(whole.budget(by) | beside, now.noise.degrees_of_freedom or np.inf, now.coverage_factor)
+
     def _change_of(self, then: Then) -> tuple[Array, Array]:
         """By how much S and Q changed (12,) from an epoch to the next one, and the standard uncertainties."""
         whole = np.column_stack([then.moved, then.moved_factor])
@@ -417,20 +427,21 @@ class State:
         ahead = self._know(record)
         self._take(record, ahead, ahead.rows(record))
 
-    def close_day(self, day: float) -> bool:
-        """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns
-        whether that was done."""
+    def close_day(self, day: float) -> Estimate | None:
+        """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns the
+        solution; None where the day is not over."""
         if self._newest_day is None or np.floor(day) <= self._newest_day:
-            return False
+            return None
         self._newest_day = int(np.floor(day))
         cuts = [step.day for step in self._steps if any(not key.startswith("lag") for key in step.u)]
         self._records = _newest(thinned(self._records, day, self._now.mean[:9].reshape(3, 3), cuts))
-        self.solve()
-        return True
+        return self.solve()
 
-    def solve(self) -> None:
+    def solve(self) -> Estimate:
         """Everything anew, from the records and the statements."""
-        self._now = self.estimate().now
+        whole = self.estimate()
+        self._now = whole.now
+        return whole
 
     def beyond(self, base: State) -> tuple[list[Record], list[Step]]:
         """The windows and the steps that an earlier state does not have, of which this one is a copy that went on."""

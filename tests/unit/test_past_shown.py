@@ -18,6 +18,7 @@ from agent.core.snapshot import pack, unpack
 from agent.delivery.history import FILE_NAME, History
 from agent.delivery.schema import write_memory
 from agent.delivery.store import Store
+from agent.report.material import gather
 from calib.model import PARAMETERS
 from tests.unit.recorded_bench import EPOCH_NS, record
 
@@ -211,3 +212,29 @@ def test_what_cannot_be_corrected_is_refused_with_a_remedy(
     status, _, err = run(capsys, "export", kept / RECORDING, "-o", to, "--data-dir", kept)
     assert status == 2
     assert "--data-dir names the windows for --corrected" in err
+
+
+def test_show_and_report_say_what_makes_u(kept: Path, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sensor = json.loads(run(capsys, "show", "--data-dir", kept, "--json", "-")[1])["sensors"]["mems"]
+    budget, update = sensor["budget"], sensor["calibration"]
+    squares = np.sum(np.square(list(budget["standard_uncertainty"].values())), axis=0)
+    np.testing.assert_allclose(np.sqrt(squares), update["standard_uncertainty"], rtol=0.01)
+    assert budget["coverage_factor"] == update["coverage_factor"]
+    line = next(line for line in run(capsys, "show", "--data-dir", kept)[1].splitlines() if "type A" in line[:9])
+    U = [2.0 * u for u in budget["standard_uncertainty"]["type A"]]
+    np.testing.assert_allclose([float(cell) for cell in line.split()[2:]], np.array(U)[[0, 4, 8, 9, 10, 11]], rtol=0.08)
+    material = gather([kept], None)
+    assert dict(material.results[0].budget).keys() == budget["standard_uncertainty"].keys()
+    assert any("that of all kept windows, solved anew" in notice for notice in material.notices)
+
+    def rolled_back(state: bytes) -> bytes:
+        held = unpack(state)
+        held["in_force"]["made_sequence"] = held["in_force"]["sequence"] = 1
+        return pack(held)
+
+    change_memory(copied, rolled_back)
+    assert (
+        "what makes U is not known: S and Q in force are not those of the newest windows"
+        in run(capsys, "show", "--data-dir", copied)[1]
+    )
+    assert not gather([copied], None).results[0].budget
