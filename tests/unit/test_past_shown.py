@@ -14,11 +14,15 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.core.memory import Memory
+from agent.core.past import KnownPast
 from agent.core.snapshot import pack, unpack
 from agent.delivery.history import FILE_NAME, History
 from agent.delivery.schema import write_memory
 from agent.delivery.store import Store
+from agent.export.smoothing import Smoothed
 from agent.report.material import gather
+from calib.estimate.correction import Law
+from calib.estimate.past import Past
 from calib.model import PARAMETERS
 from tests.unit.recorded_bench import EPOCH_NS, record
 
@@ -119,6 +123,28 @@ def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     begins = columns["time_s"][columns["calibration"] > 0][0] - EPOCH_NS * 1e-9
     assert begins == pytest.approx(min(found), abs=1.0)  # from the next block on
     assert set(columns["calibration"].tolist()) == {0, *found.values()}
+
+
+def test_samples_between_two_epochs_are_corrected_by_what_is_between_their_values() -> None:
+    """S grows by 2 % and Q by 1 m/s2 in a day; S and Q depend on the temperature as well."""
+    sides = ((1.0, 0.0), (1.02, 1.0))
+    laws = [Law(np.append(size * np.eye(3).ravel(), [Q] * 3 + [0.1] * 3), np.eye(15), 1) for size, Q in sides]
+    past = Past(np.array([5.0, 6.0]), laws, (1, 1), (), 5.0, 2.0)
+    known = KnownPast("mems", "mems A", "A", "m/s2", past, "", 6.0, EPOCH_NS)
+    smoothed, hour_ns = Smoothed({"A": known}, {"B": "B has none"}), 3600 * 10**9
+    V = np.array([[2.02, 1.01, 0.0]])
+    a, why = smoothed.acceleration("A", V, EPOCH_NS - 12 * hour_ns, 22.0)
+    assert why == ""
+    assert a is not None
+    np.testing.assert_allclose(a, (V - 0.5 - 0.2) / 1.01, rtol=1e-12)
+    for hours, (size, Q) in ((-24.5, sides[0]), (0.9, sides[1])):
+        a, _ = smoothed.acceleration("A", V, EPOCH_NS + round(hours * hour_ns), None)
+        np.testing.assert_allclose(a, (V - Q) / size, rtol=1e-12)
+    a, why = smoothed.acceleration("A", V, EPOCH_NS + 61 * hour_ns // 60, None)
+    assert a is None
+    assert "more than an hour before the first window (2026-09-20T14:13:20Z) or after the last one" in why
+    assert smoothed.acceleration("B", V, EPOCH_NS, None) == (None, "B has none")
+    assert smoothed.acceleration("C", V, EPOCH_NS, None) == (None, "no state is kept of the device C")
 
 
 def test_the_kept_state_tells_the_past_beside_a_running_agent(

@@ -17,7 +17,7 @@ from calib.estimate.nuisances import Priors
 from calib.estimate.record import Record
 from calib.estimate.rows import CORRECTION, LAGS, OFFSETS, TYPE_A, Degrees, Noise, Rows
 from calib.estimate.state import State
-from calib.estimate.statements import Statements
+from calib.estimate.statements import Statements, Step
 from calib.estimate.thinning import thinned
 from calib.estimate.type_a import LEAST_INFLATION
 from calib.estimate.wander import TemperatureModel
@@ -153,7 +153,8 @@ def resting(record: Record) -> Record:
 
 def test_rests_alone_and_merged_records_have_budgets_as_well(clamped: list[Record]) -> None:
     records = thinned(many(np.random.default_rng(13), 90, 0.25), 1e4, np.eye(3))
-    stated = Statements(MEAN, U, {"": Priors()}, walking(sensitivity=2e-5, offset_mps2=1e-3), TemperatureModel())
+    walks, before = walking(sensitivity=2e-5, offset_mps2=1e-3), Step(-1.0, {"Syy": 0.05})
+    stated = Statements(MEAN, U, {"": Priors()}, walks, TemperatureModel(), steps=(before,))
     assert max(record.windows for record in records) > 10
     for own in (records, [resting(record) for record in clamped]):
         whole = estimate(own, stated)
