@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,8 +21,11 @@ from agent.terminal.text import one_line, say
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
+    from agent.core.memory import Memory
     from agent.terminal.console import TextConsole
+    from calib.estimate.sources import Sources
 
+SOURCES_SHOWN = 5  # of U; --json has all
 HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
 
 
@@ -121,6 +125,7 @@ class SensorHistory:
     windows: list[Record]
     drift: list[Record]  # verdicts of the drift test
     routine: dict[str, list[Record]]  # results that come by schedule; key: their kind
+    budget: Sources | str  # of the calibration in force; why it is not known
 
     @property
     def records(self) -> list[Record]:
@@ -155,6 +160,7 @@ def read_overview(data_dir: Path, limit: int, public_key: Path | None = None) ->
     keys = _keys(public_key)
     with History(data_dir / FILE_NAME, keys, signed_only=keys is not None) as history:
         history.check()
+        memories = history.memories()
         in_force = {record.sensor: record for record in history.latest() if record.what == "calibration"}
         sensors = {
             sensor: SensorHistory(
@@ -164,6 +170,7 @@ def read_overview(data_dir: Path, limit: int, public_key: Path | None = None) ->
                 windows=history.newest(sensor, "window", limit=limit),
                 drift=history.newest(sensor, "drift", limit=limit),
                 routine={w: history.newest(sensor, w, limit=limit) for w, kind in RESULTS.items() if kind.routine},
+                budget=_budget(in_force.get(sensor), memories),
             )
             for sensor in sorted({sensor for sensor, _ in history.channels() if sensor})
         }
@@ -187,6 +194,7 @@ def as_object(overview: Overview) -> dict[str, Any]:
             sensor: {
                 "status": held.status.fields if held.status else None,
                 "calibration": held.calibration.fields if held.calibration else None,
+                "budget": _budget_object(held.budget),
                 "history": [record.fields for record in held.calibrations],
                 "windows": [record.fields for record in held.windows],
                 "drift": [record.fields for record in held.drift],
@@ -230,7 +238,7 @@ def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> Non
     heading = Text.assemble((one_line(sensor), "bold"), "  ", status_text, f"  {said}")
     console.print(heading, soft_wrap=True)
     if held.calibration and isinstance(calibration := held.calibration.result, CalibrationUpdate):
-        _print_calibration(console, calibration)
+        _print_calibration(console, calibration, held.budget)
     else:
         console.print("  no calibration in force")
     console.print("  newest calibrations" if held.calibrations else "  no calibration yet", style="dim")
@@ -252,7 +260,7 @@ def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> Non
     console.print()
 
 
-def _print_calibration(console: TextConsole, calibration: CalibrationUpdate) -> None:
+def _print_calibration(console: TextConsole, calibration: CalibrationUpdate, budget: Sources | str) -> None:
     from agent.terminal.wording import calibration_cells, uncertainty_words
     from calib.recorded.output_unit import shown_in
     from calib.rounding import aligned
@@ -263,8 +271,47 @@ def _print_calibration(console: TextConsole, calibration: CalibrationUpdate) -> 
         f"{shown_in(calibration.output_unit).words}, {uncertainty_words(calibration)}",
         f"method {calibration.method}, {counted(calibration.windows, 'windows')}, {_since(calibration)}",
         f"of {calibration.identity}",
+        *_budget_lines(budget, calibration.output_unit),
     ):
         console.print_line(f"  {line}")
+
+
+def _budget(in_force: Record | None, memories: Sequence[Memory]) -> Sources | str:
+    from agent.core.past import PastError, budget_in_force
+
+    if in_force is None or not isinstance(update := in_force.result, CalibrationUpdate):
+        return "no calibration is in force"
+    try:
+        return budget_in_force(update, memories)
+    except PastError as error:
+        return str(error)
+
+
+def _budget_object(budget: Sources | str) -> dict[str, Any]:
+    """Standard uncertainties of S row by row, then Q, by source."""
+    if isinstance(budget, str):
+        return {"none": budget}
+    return {
+        "standard_uncertainty": {source: u.tolist() for source, u in budget.by_source.items()},
+        "coverage_factor": budget.coverage_factor,
+        "degrees_of_freedom": budget.degrees_of_freedom.tolist(),
+    }
+
+
+def _budget_lines(budget: Sources | str, unit: str) -> Iterator[str]:
+    """The largest sources of U, each with its part of U of the main sensitivities and of Q."""
+    from calib.model import PARAMETERS
+    from calib.recorded.output_unit import shown_in
+    from calib.rounding import aligned, rounded
+
+    if isinstance(budget, str):
+        yield f"what makes U is not known: {budget}"
+        return
+    chosen = [0, 4, 8, 9, 10, 11]
+    factors = budget.coverage_factor * shown_in(unit).factors
+    largest = list(budget.by_source.items())[:SOURCES_SHOWN]
+    rows = [(source, *map(rounded, (factors * u)[chosen].tolist())) for source, u in largest]
+    yield from aligned([("largest sources", *(f"U({PARAMETERS[k]})" for k in chosen)), *rows])
 
 
 def _since(calibration: CalibrationUpdate) -> str:

@@ -18,7 +18,16 @@ from agent.core.fault import told
 from agent.core.identity import device_of, identity_of, nominal_of
 from agent.core.kept import keep, kept_as, plain, restated, shelved, take_up, update_of
 from agent.core.operators import CommandError, answer, commanded_pose
-from agent.core.outcome import Source, again, calibration_update, drift_report, estimate, status_change, window_report
+from agent.core.outcome import (
+    Source,
+    again,
+    calibration_update,
+    drift_report,
+    estimate,
+    status_change,
+    window_report,
+    with_budget,
+)
 from agent.core.references import References
 from agent.core.run_time import RunTime
 from agent.core.streams import Streams, Verdict
@@ -263,7 +272,7 @@ class ChannelState:
     def _put_in_force(self, earlier: CalibrationUpdate | None = None) -> CalibrationUpdate:
         """The update that puts the estimation's calibration in force. `earlier` made it, if it was made before."""
         assert self._estimation is not None
-        update = self._update(self._estimation.in_force)
+        update = with_budget(self._update(self._estimation.in_force), self._estimation.budget)
         self._in_force = update if earlier is None else again(update, earlier)
         return self._in_force
 

@@ -17,15 +17,18 @@ from agent.core.windows import Found
 from calib.estimate.axes import LEAST_S, where_nothing_moved
 from calib.estimate.correction import Law
 from calib.estimate.drift import DriftTest, DriftVerdict
+from calib.estimate.estimate import Estimate
 from calib.estimate.innovation import Innovation
 from calib.estimate.record import Record
 from calib.estimate.reference_share import ReferenceShare
+from calib.estimate.sources import Sources
 from calib.estimate.state import State
 from calib.estimate.statements import Step
 from calib.model import Calibration, Window, WindowSums
 from calib.signal.response import Response
 
 DAY_S = 86400.0
+SAME_BUDGET = 1e-9  # of a variance: to which the squares of a budget add up
 SAME = 1e-6  # standard uncertainties: what rounding moves when the windows are taken again
 
 
@@ -98,6 +101,7 @@ class Estimation:
         self.drift = DriftTest(channel.drift.settings())
         self._held: list[Record] = []
         self._proposed: list[Proposal] = []
+        self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
         self._tried: Tried | None = None  # what `after` did, for `judge` right after it
         self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
@@ -170,7 +174,7 @@ class Estimation:
         self, window: Window, day: float, lag_s: float, temperature_degc: float, anew: Anew | None = None
     ) -> Judged:
         """Take, hold or refuse one used window. `anew`: the search that found its lag, if there was one."""
-        if self.state.close_day(day):
+        if (whole := self.state.close_day(day)) is not None:
             self._tried = None
         if anew is None:
             tried = self._tried_of(window, day, lag_s, temperature_degc)
@@ -200,7 +204,7 @@ class Estimation:
         elif decision.action == "adopt":
             assert adopted is not None
             self.state = adopted
-            self.state.solve()
+            whole = self.state.solve()
             self.drift.restart(innovation.information > 0.0)
             decision = replace(decision, reason=f"{decision.reason}{who}")
         kept = held if decision.action == "hold" else self._held
@@ -213,8 +217,8 @@ class Estimation:
             if not self.gate.held:  # else it is for windows that agree to confirm it
                 self._follow()
         if decision.in_force:
-            self.in_force, self.law = self.state.result(), self.state.law()
             self.residual_sd = self.state.residual_sd
+            self._update_in_force(whole, record if decision.action == "take" else None)
         if decision.action == "hold":
             if decision.proposal is not None:
                 made = trial if decision.proposal is candidate else adopted
@@ -289,7 +293,7 @@ class Estimation:
         mean, covariance = law.mean.copy(), law.covariance.copy()
         mean[:12] = np.append(calibration.sensitivity.ravel(), calibration.offset)
         covariance[:12, :12] = calibration.covariance
-        self.in_force = calibration
+        self.in_force, self.budget = calibration, None
         self.law = replace(law, mean=mean, covariance=covariance, determined=calibration.determined)
         self._held, self._proposed = [], []
 
@@ -298,7 +302,7 @@ class Estimation:
 
         Held windows of another reference are dropped. Returns whether the calibration in force changed.
         """
-        before, follows = self.state.reference, self._follows_state()
+        before, follows = self.state.reference, self.follows_state()
         changed = self.state.meet(reference, calibrated, sensitivity)
         if before not in ("", self.state.reference):
             self.gate.dismiss()
@@ -312,7 +316,7 @@ class Estimation:
         `remounted`: the stated poses changed. `size`: other filters are known, and those of the sensor pass so many
         times what they did. Returns whether the calibration in force changed.
         """
-        follows = self._follows_state()
+        follows = self.follows_state()
         if size is not None:
             u_S = (size - 1.0) * self.state.result().sensitivity.ravel()
             for place in range(len(self._beside)):
@@ -327,14 +331,21 @@ class Estimation:
         changed = self.state.restate(gravity_mps2) or size is not None
         return changed and follows and self._update_in_force()
 
-    def _follows_state(self) -> bool:
+    def follows_state(self) -> bool:
         """Whether the calibration in force is that of the state, but for rounding."""
         now, u = self.state.result(), self.in_force.standard_uncertainty
         moved = np.append(now.sensitivity - self.in_force.sensitivity, now.offset - self.in_force.offset)
         return self.gate.calibrated and bool(np.all(np.abs([moved, now.standard_uncertainty - u]) <= SAME * u))
 
-    def _update_in_force(self) -> bool:
-        self.in_force, self.law = self.state.result(), self.state.law()
+    def _update_in_force(self, whole: Estimate | None = None, record: Record | None = None) -> bool:
+        """Put the state's S and Q in force. `whole`: the solution from which they follow, before `record` if that is
+        named. Their budget is known where the two say the same."""
+        self.in_force, self.law, self.budget = self.state.result(), self.state.law(), None
+        whole = whole.with_window(record) if whole is not None and record is not None else whole
+        if whole is not None:
+            found, variances = self.state.budget(whole), self.in_force.covariance.diagonal()
+            if np.allclose(found.standard_uncertainty**2, variances, rtol=SAME_BUDGET, atol=0.0):
+                self.budget = found
         return True
 
     def _follow(self) -> None:

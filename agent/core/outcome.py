@@ -24,6 +24,7 @@ from calib.estimate.drift import DriftVerdict
 from calib.estimate.quantities import MAIN_TEMPERATURE, RATES, offset_temperature
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import ResponseTold
+from calib.estimate.sources import Sources
 from calib.estimate.state import State
 from calib.model import Array, Calibration, Window
 
@@ -75,6 +76,14 @@ def calibration_update(
     )  # fmt: skip
 
 
+def with_budget(update: CalibrationUpdate, budget: Sources | None) -> CalibrationUpdate:
+    """The update with what makes its U, where that is known."""
+    if budget is None:
+        return update
+    told = {source: u.tolist() for source, u in budget.by_source.items()}
+    return msgspec.structs.replace(update, budget=told, degrees_of_freedom=budget.degrees_of_freedom.tolist())
+
+
 def _shared_errors(
     shares: Sequence[ReferenceShare], certificate_of: Callable[[str], Certificate | None]
 ) -> list[SharedError]:
@@ -111,13 +120,13 @@ def _over_frequency(told: ResponseTold | None) -> dict[str, Any]:
 def again(update: CalibrationUpdate, before: CalibrationUpdate) -> CalibrationUpdate:
     """`update` for a calibration that comes into force again.
 
-    It keeps the identity, the date and the shared errors that it has in `before`.
+    It keeps the identity, the date, the shared errors and the budget that it has in `before`.
     """
     run_id, sequence = before.made
     return msgspec.structs.replace(
         update, made_run_id=run_id, made_sequence=sequence, made_utc_ns=before.date_utc_ns,
         made_engine=before.by_engine,
-        shared_errors=before.shared_errors,
+        shared_errors=before.shared_errors, budget=before.budget, degrees_of_freedom=before.degrees_of_freedom,
     )  # fmt: skip
 
 

@@ -1,17 +1,23 @@
-"""S(t), Q(t) and U(t) of a sensor's past, from its kept state: windows, statements and decisions."""
+"""S(t), Q(t) and U(t) of a sensor's past, and what makes U now, from its kept state."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from agent.config import Channel
 from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import DAY_S, Estimation
+from agent.core.events import CalibrationUpdate
 from agent.core.kept import MALFORMED, update_of
 from agent.core.memory import Memory
 from agent.core.snapshot import pack, unpack
 from calib.estimate.past import Past
+from calib.estimate.sources import Sources
 
 
 class PastError(ValueError):
@@ -57,26 +63,56 @@ class KnownPast:
 
 def past_of(memory: Memory) -> KnownPast:
     """The past by all windows of a kept state. Raises PastError where it has none."""
+    state, estimation = _taken_up(memory)
+    if not estimation.state.windows:
+        raise PastError("no window was taken yet; its past begins with the first one")
+    try:
+        in_force = update_of(state["in_force"])
+        unit = "" if in_force is None else in_force.output_unit
+        sha256 = hashlib.sha256(pack(state["estimation"]["state"])).hexdigest()
+        days = float(state["day"]), int(state["t_utc_ns"])
+        return KnownPast(memory.sensor, memory.identity, state["device"], unit, estimation.state.past(), sha256, *days)
+    except MALFORMED as error:
+        raise _unreadable(error) from None
+
+
+def budget_in_force(update: CalibrationUpdate, memories: Iterable[Memory]) -> Sources:
+    """What makes U of the calibration in force: as its result says, or by the kept state, which is solved anew.
+
+    Raises PastError where neither tells it.
+    """
+    if update.budget:
+        told = {source: np.array(u) for source, u in update.budget.items()}
+        return Sources(told, np.array(update.degrees_of_freedom), update.coverage_factor)
+    memory = next((m for m in memories if (m.sensor, m.identity) == (update.sensor, update.identity)), None)
+    if memory is None:
+        raise PastError("no state of its device is kept")
+    state, estimation = _taken_up(memory)
+    in_force = update_of(state["in_force"])
+    if in_force is None or in_force.made != update.made or not estimation.follows_state():
+        raise PastError("S and Q in force are not those of the newest windows")
+    return estimation.state.budget()
+
+
+def _taken_up(memory: Memory) -> tuple[dict[str, Any], Estimation]:
+    """The content of a kept state, and its estimation. Raises PastError."""
     try:
         state = unpack(memory.state)
         held = state.get("estimation")
         if not isinstance(held, dict) or held.get("state") is None or "channel" not in state:
             raise PastError(
-                "its state is of an earlier version, which kept no windows; it has a past after the next windows"
+                "its state is of an earlier version, which kept no windows; the next windows make one that has them"
             )
         filters = DriverFilters(Channel.model_validate_json(state["channel"]))
         filters.load(state["filters"])
         estimation = Estimation(filters.channel, state["nominal"])
         estimation.load(held)
-        in_force = update_of(state["in_force"])
-        unit = "" if in_force is None else in_force.output_unit
-        sha256 = hashlib.sha256(pack(held["state"])).hexdigest()
-        past = estimation.state.past()
-        day, t_utc_ns = float(state["day"]), int(state["t_utc_ns"])
+        return state, estimation
     except PastError:
         raise
     except MALFORMED as error:
-        raise PastError(f"its state cannot be read: {str(error) or type(error).__name__}".splitlines()[0]) from None
-    if not past.windows:
-        raise PastError("no window was taken yet; its past begins with the first one")
-    return KnownPast(memory.sensor, memory.identity, state["device"], unit, past, sha256, day, t_utc_ns)
+        raise _unreadable(error) from None
+
+
+def _unreadable(error: Exception) -> PastError:
+    return PastError(f"its state cannot be read: {str(error) or type(error).__name__}".splitlines()[0])

@@ -52,6 +52,7 @@ _S_AND_Q = [name.lower() for name in PARAMETERS]
 _U = [f"u_{name}" for name in _S_AND_Q]
 _BY_POWER = ["offset_temperature", "u_offset_temperature"]
 _BY_AXIS = ["sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate"]
+_LISTED = ["determined", "references", "valid_band_hz", "degrees_of_freedom", *_BY_AXIS]
 _BY_UNKNOWN = ["derivative", "own_derivative"]
 _LISTS = ["sensitivity", "unknowns", "kinds", "stated", "u_stated", "value"]
 _RESIDUALS = ["residual_sd_x", "residual_sd_y", "residual_sd_z"]
@@ -186,6 +187,9 @@ def _calibration_message(event_sequence: int, update: CalibrationUpdate) -> pb.C
     values["sensitivity_at_0hz"] = pb.Calibration.Steady(**_flat(values["sensitivity_at_0hz"]))
     values["response"] = [pb.Calibration.Band(**_flat(band)) for band in values["response"]]
     values["shared_errors"] = [_shared_message(error) for error in values["shared_errors"]]
+    values["budget"] = [
+        pb.Calibration.Source(name=name, standard_uncertainty=u) for name, u in values["budget"].items()
+    ]
     return pb.Calibration(event_sequence=event_sequence, covariance=covariance.ravel(), **values)
 
 
@@ -198,7 +202,8 @@ def _decode_calibration(data: bytes) -> tuple[int, Result]:
     values["residual_sd"] = [values.pop(name) for name in _RESIDUALS]
     values["covariance"] = np.array(values["covariance"]).reshape(12, 12).tolist()
     values |= {name: np.reshape(values[name], (-1, 3)).tolist() for name in _BY_POWER}
-    values |= {name: list(values[name]) for name in ("determined", "references", "valid_band_hz", *_BY_AXIS)}
+    values |= {name: list(values[name]) for name in _LISTED}
+    values["budget"] = {source.name: list(source.standard_uncertainty) for source in values["budget"]}
     values["response"] = [_square(band) for band in values["response"]]
     values["shared_errors"] = [_shared_values(error) for error in values["shared_errors"]]
     if "sensitivity_at_0hz" in values:

@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from agent.calibrate.origin import SourceFile, source_file
 from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.core.memory import Memory
+from agent.core.outcome import with_budget
+from agent.core.past import PastError, budget_in_force
 from agent.delivery.calibrations import calibrations, made
 from agent.delivery.evidence import evidence
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
@@ -120,7 +124,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     with History(directory / FILE_NAME) as history:
         names = sorted({name for name, what in history.channels() if name and what in ("window", "calibration")})
         chosen = _chosen(sensor, names, str(directory))
-        in_force = history.in_force(chosen)
+        in_force, memories = history.in_force(chosen), history.memories()
         kept = calibrations(history, chosen, limit=MOST_HISTORY)[::-1]
         seen = history.newest(chosen, "window", limit=MOST_HISTORY, run_id=_run_of(history, chosen, in_force))[::-1]
         status = next(iter(history.newest(chosen, "status", limit=1)), None)
@@ -133,7 +137,9 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     recorded.status = status.result if status and isinstance(status.result, StatusChange) else recorded.status
     updates = [record.result for record in kept if isinstance(record.result, CalibrationUpdate)]
     newest = [in_force.result] if in_force and isinstance(in_force.result, CalibrationUpdate) else []
+    newest, told = _with_budget(newest, memories)
     material = _of(recorded, windows, newest)
+    material.notices += told
     material.history = updates
     material.files = [source_file(path) for path in paths]
     material.notices += said
@@ -141,6 +147,22 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
         f"the recording {name} does not exist any more, so its windows are not shown point by point" for name in lost
     ]
     return material
+
+
+def _with_budget(
+    newest: Sequence[CalibrationUpdate], memories: Sequence[Memory]
+) -> tuple[list[CalibrationUpdate], list[str]]:
+    """The calibration in force with what makes its U, and what is to be said of that."""
+    for update in newest:
+        if not update.budget:
+            try:
+                found = budget_in_force(update, memories)
+            except PastError as error:
+                return [update], [f"the uncertainty budget is not known: {error}"]
+            ratio = found.standard_uncertainty / np.array(update.standard_uncertainty)
+            said = "the uncertainty budget is that of all kept windows, solved anew; its u is {:.3f} to {:.3f} times u"
+            return [with_budget(update, found)], [said.format(ratio.min(), ratio.max())]
+    return list(newest), []
 
 
 def _run_of(history: History, sensor: str, in_force: Record | None) -> str:

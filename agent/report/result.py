@@ -219,6 +219,8 @@ def from_update(
         "sensitivity_at_0hz": asdict(update.sensitivity_at_0hz) if update.sensitivity_at_0hz.sensitivity else None,
         "response": [asdict(band) for band in update.response] or None,
         "shared_errors": [asdict(error) for error in update.shared_errors],
+        "budget": update.budget,
+        "degrees_of_freedom": update.degrees_of_freedom or None,
         "run_id": update.made[0],
         "sequence": update.made[1],
     }

@@ -11,7 +11,7 @@ squared: normal equations would lose half of the digits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,3 +99,13 @@ def returned(root: Array, link: Link) -> Array:
     rows = np.column_stack([of_next @ p.noise, of_next @ follows, z - of_next @ p.gap])
     rows[:j, :j] += link.own
     return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
+def gains(links: Sequence[Link], last: Array) -> Iterator[tuple[Array, Array]]:
+    """Of each epoch, from the last one back to the first: covariances of d (N, m), and of the w of the passage to it
+    (J, m), with m quantities; `last` (N, m) are those of d at the last epoch. No w comes before the first epoch."""
+    for link in reversed(links):
+        noise = -np.linalg.inv(link.own) @ link.next @ last
+        yield last, noise
+        last = link.passage.back @ (last - link.passage.noise @ noise)
+    yield last, np.zeros((0, last.shape[1]))

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 
 from calib.distributions import coverage_factor
-from calib.estimate.chain import Link, Passage, passed, returned, solved
+from calib.estimate.chain import Link, Passage, gains, passed, returned, solved
 from calib.estimate.gauss_newton import Lines, gauss_newton
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.physics import SIZE, STEP, Stack, Windows
-from calib.estimate.quantities import KINDS, LAG, RESPONSE, Quantity
+from calib.estimate.quantities import KINDS, LAG, PRIOR, RESPONSE, Quantity
 from calib.estimate.record import Record, together
 from calib.estimate.rows import Degrees, Noise, Rows
 from calib.estimate.statements import Statements
@@ -252,6 +252,48 @@ class Estimate:
             root, noise = joint[j:, j:], link.passage.noise
             then = replace(self.now, day=float(self.days[k]), x=self.x[k], around=self.around[k], root=root)
             yield Then(then, noise @ d[:j], noise @ factor[:j])
+
+    def with_window(self, record: Record) -> Estimate | None:
+        """With one more window, appended as `Now.with_window` does it; None where that is not later than all others, or
+        has unknowns of its own."""
+        if record.setting not in self.unknowns or record.day <= self.days[-1]:
+            return None
+        record = together([*self.records, record], fixed=self.unknowns.statements.held_mps2 is not None)[-1]
+        ahead, noise = self.now.passed_to(record.day), self.noise.pooled(record)
+        degrees, days = Degrees.of(self.unknowns, self.seen_degc, ahead.x), np.append(self.days, record.day)
+        (rows,) = Rows(self.unknowns, [record], days[-1:], noise, degrees).at(ahead.x[None], ahead.around[None])
+        root, link = passed(self.root, self.unknowns.passage(float(self.days[-1]), record.day)[2], rows)
+        return replace(
+            self, records=[*self.records, record], noise=noise, days=days, root=root, links=[*self.links, link],
+            epoch_of=np.append(self.epoch_of, len(days) - 1), x=np.vstack([self.x, ahead.x]),
+            around=np.vstack([self.around, ahead.around]), rows=[*self.rows, rows],
+        )  # fmt: skip
+
+    def budget(self, by: Array) -> dict[str, Array]:
+        """By source, what it adds to the variances (m,) of quantities of the last epoch, of which `by` (m, N) are the
+        derivatives by the unknowns. All together are their variances."""
+        factor, found = self.now.factor, dict[str, Array]()
+
+        def add(source: str, variance: Array) -> None:
+            found[source] = found.get(source, 0.0) + variance
+
+        epochs = list(gains(self.links, factor @ (by @ factor).T))[::-1]
+        for own, u, gain in zip(self.unknowns.all, self.unknowns.prior[1], epochs[0][0], strict=True):
+            add(own.quantity.kind.source, (gain / u) ** 2)
+        for link, (_, noise) in zip(self.links, epochs[1:], strict=True):
+            for moved, gain in zip(link.passage.noise.T, noise, strict=True):
+                kind = self.unknowns.all[int(np.flatnonzero(moved)[0])].quantity.kind
+                add(kind.walked_source or kind.source, gain**2)
+        for stated in self.unknowns.statements.dated:
+            k = int(np.searchsorted(self.days, stated.day))
+            rows = self.unknowns.dated(stated, self.x[k])[:, :-1]
+            add(PRIOR, ((rows @ epochs[k][0]) ** 2).sum(axis=0))
+        degrees = Degrees.of(self.unknowns, self.seen_degc, self.x[-1])
+        rows_of = Rows(self.unknowns, self.records, self.days[self.epoch_of], self.noise, degrees)
+        by_record = [own[:, :-1] @ epochs[k][0] for own, k in zip(self.rows, self.epoch_of.tolist(), strict=True)]
+        for source, variance in rows_of.shares(by_record).items():
+            add(source, variance)
+        return found
 
 
 def estimate(

@@ -111,18 +111,32 @@ class OverFrequency:
         """A factor (N, N + 4) of the covariance of a state beside a reference, with what known filters, the bands'
         deviations and what they leave open add to that of S. (N, N) before any band.
         """
+        parts, by_axis = self._relative(state, reference, priors)
+        if not any(parts.values()) and not by_axis:
+            return state.factor
+        more = np.zeros((len(state), 4))
+        more[:9, 0] = float(np.linalg.norm(list(parts.values()))) * state.mean[:9]
+        for row in range(3):
+            own = slice(3 * row, 3 * row + 3)
+            more[own, 1 + row] = by_axis * state.mean[own]
+        return np.hstack([state.factor, more])
+
+    def _relative(self, state: Now, reference: str, priors: Priors) -> tuple[dict[str, float], float]:
+        """Relative standard uncertainties that they add to S: those common to all elements, by source, and that of each
+        axis by itself."""
         stated = self.stated(priors)
         hz = stated.reference_frequency_hz or self.first_hz
         by_axis = self.left_open.by_axis(self._terms(state, reference), _at_reference(stated))
-        parts = [priors.known_u, self.deviations.between.beyond(by_axis.explains), self.left_open.u_lost(hz)]
-        if not any(parts) and not by_axis.u:
-            return state.factor
-        more = np.zeros((len(state), 4))
-        more[:9, 0] = float(np.linalg.norm(parts)) * state.mean[:9]
-        for row in range(3):
-            own = slice(3 * row, 3 * row + 3)
-            more[own, 1 + row] = by_axis.u * state.mean[own]
-        return np.hstack([state.factor, more])
+        between = self.deviations.between.beyond(by_axis.explains)
+        common = {"known filters": priors.known_u, "response between bands": between}
+        return {**common, "whose noise it is": self.left_open.u_lost(hz)}, by_axis.u
+
+    def budget(self, state: Now, reference: str, priors: Priors, by: Array) -> dict[str, Array]:
+        """By source, what `factor` adds to the variances (m,) of quantities with the derivatives `by` (m, N)."""
+        parts, by_axis = self._relative(state, reference, priors)
+        rows = (by[:, :9] * state.mean[:9]).reshape(len(by), 3, 3).sum(axis=2)
+        found = {source: (u * rows.sum(axis=1)) ** 2 for source, u in parts.items()}
+        return found | {"response by axis": (by_axis**2 * rows**2).sum(axis=1)}
 
     def _terms(self, state: Now, reference: str) -> Array:
         """The terms (K,) of the response beside a reference."""

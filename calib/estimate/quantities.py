@@ -71,7 +71,8 @@ class Kind:
 
     `name`: identifies the kind in a snapshot.
     `unit`: unit of the value; "" for S, Q and their coefficients, whose unit contains the sensor's output unit.
-    `source`: the line of the uncertainty budget that its prior belongs to.
+    `source`: the line of the uncertainty budget that its prior belongs to; that of its walk and its steps as well, but
+    where `walked_source` names another.
     `prior`, `mean`: standard uncertainty and value before any data; without `mean` the value is 0. If `prior` is None,
     calib.estimate.unknowns gets the uncertainty as an argument (S, Q, coefficients of temperature).
     `walk`: SD of its random walk after one day; None for a constant.
@@ -102,6 +103,7 @@ class Kind:
     straight: float = STRAIGHT
     stated: bool = True
     since_certificate: bool = False
+    walked_source: str = ""
 
     @property
     def statements(self) -> list[Statement]:
@@ -168,8 +170,11 @@ def by_name(statements: Iterable[Statement]) -> dict[str, Statement]:
 
 # --- the sensor
 
+PRIOR, WALK, TEMPERATURE = "prior of S and Q", "walks and steps of S and Q", "temperature"
 SENSITIVITY = Kind(
     "sensitivity",
+    source=PRIOR,
+    walked_source=WALK,
     walk=Statement("sensitivity", 5e-5, ("process.sensitivity_pct",), convert=_percent),
     in_output_unit=True,
     loosened_by=("jump",),
@@ -177,6 +182,8 @@ SENSITIVITY = Kind(
 TILT_WALK = Statement("tilt_rad", 3.5e-5, ("process.tilt_deg",), convert=_deg)
 OFFSET = Kind(
     "offset",
+    source=PRIOR,
+    walked_source=WALK,
     walk=Statement("offset_mps2", 0.002, ("process.offset_mps2",)),
     in_output_unit=True,
     loosened_by=("jump",),
@@ -184,15 +191,16 @@ OFFSET = Kind(
 )
 OFFSET_RATE = Kind(
     "offset rate",
+    source="rates of S and Q",
     prior=Statement("offset_rate_mps2", 0.001, ("process.offset_rate_mps2",)),
     walk=Statement("offset_rate_walk_mps2", 2e-5, ("process.offset_rate_walk_mps2",)),
     in_output_unit=True,
     straight=LINEAR,
 )
 # Comes into a state only when a drift of S was found, with the standard uncertainty that this drift has.
-SENSITIVITY_RATE = Kind("sensitivity rate", in_output_unit=True, straight=LINEAR)
-SENSITIVITY_TEMPERATURE = Kind("sensitivity over temperature")
-OFFSET_TEMPERATURE = Kind("offset over temperature", straight=LINEAR)
+SENSITIVITY_RATE = Kind("sensitivity rate", source=OFFSET_RATE.source, in_output_unit=True, straight=LINEAR)
+SENSITIVITY_TEMPERATURE = Kind("sensitivity over temperature", source=TEMPERATURE)
+OFFSET_TEMPERATURE = Kind("offset over temperature", source=TEMPERATURE, straight=LINEAR)
 SENSOR_CORNER = Kind(
     "sensor corner", "Hz", "corner frequency",
     prior=Statement("sensor_corner_hz", 0.0, ("prior.u_corner_hz",), option="u_sensor_corner_hz"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.estimate import physics
 from calib.estimate.physics import Stack, Windows
-from calib.estimate.quantities import offset_temperature
+from calib.estimate.quantities import TEMPERATURE, WALK, offset_temperature
 from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
@@ -92,6 +92,10 @@ class Degrees:
         return found
 
 
+TYPE_A, OFFSETS, LAGS = "type A", "offset between windows", "lag between windows"
+CORRECTION, UNSEEN = "correction for the reference's noise", "directions without motion"
+
+
 class Rows:
     """The rows of records as functions of the unknowns. `epoch_day` (W,) is the day of the epoch of each."""
 
@@ -111,8 +115,7 @@ class Rows:
             windows = Windows(stack, degc, nominal, held, at_hz=hz, share=share, known_size=size)
             pairs = [unknowns.effect(records[w], float(epoch_day[w])) for w in at]
             effect, taken_out = np.array([e for e, _ in pairs]), np.array([a for _, a in pairs])
-            slopes = _slope_weights(own, windows, unknowns, noise)
-            means = _mean_weights(own, windows, unknowns, noise, degrees)
+            slopes, means = _Slopes(own, windows, unknowns, noise), _Means(own, windows, unknowns, noise, degrees)
             by_bands = _told(own) if told else None
             self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, by_bands))
 
@@ -130,6 +133,15 @@ class Rows:
                 found[w] = rows
         return found
 
+    def shares(self, gains: Sequence[Array]) -> dict[str, Array]:
+        """By source, what it adds to the variances of m quantities that move by `gains` (r, m) with the rows of each
+        record. Their sum over the sources is the sum of the squares of all gains."""
+        found: dict[str, Array] = {}
+        for group in self._groups:
+            for source, variance in group.shares(np.array([gains[w] for w in group.at])).items():
+                found[source] = found.get(source, 0.0) + variance
+        return found
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Group:
@@ -137,8 +149,8 @@ class _Group:
     windows: Windows
     effect: Array
     taken_out: Array
-    slope_weights: Array
-    mean_weights: Array
+    slopes: _Slopes
+    means: _Means
     told: Array | None
 
     def rows(self, x: Array, around: Array) -> Array:
@@ -147,14 +159,23 @@ class _Group:
         slope, mean, d_slope, d_mean = self.windows.linear(p, near, live)
         on = self.effect[:, live]
         parts = [
-            self.slope_weights @ np.concatenate([d_slope @ on, slope[..., None]], axis=2),
-            self.mean_weights @ np.concatenate([d_mean @ on, mean[..., None]], axis=2),
+            self.slopes.weights @ np.concatenate([d_slope @ on, slope[..., None]], axis=2),
+            self.means.weights @ np.concatenate([d_mean @ on, mean[..., None]], axis=2),
         ]
         if self.told is not None:
             moves, left = self.told[..., :-1], self.told[..., -1:]
             left = left - moves @ p[:, physics.RESPONSE, None]
             parts.append(np.concatenate([moves @ self.effect[:, physics.RESPONSE], left], axis=2))
         return np.concatenate(parts, axis=1)
+
+    def shares(self, gains: Array) -> dict[str, Array]:
+        slopes, means = self.slopes.weights.shape[1], self.means.weights.shape[1]
+        of_slopes, of_means, of_told = np.split(gains, [slopes, slopes + means], axis=1)
+        found = self.slopes.shares(of_slopes)
+        for source, variance in self.means.shares(of_means).items():
+            found[source] = found.get(source, 0.0) + variance
+        found[TYPE_A] = found[TYPE_A] + (of_told**2).sum(axis=(0, 1))
+        return found
 
 
 def _told(records: Sequence[Record]) -> Array:
@@ -165,48 +186,78 @@ def _told(records: Sequence[Record]) -> Array:
     return found
 
 
-def _slope_weights(records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise) -> Array:
-    """(W, 6M, 6M) by what the slopes of W windows are multiplied, so that their covariance is one."""
-    s, n = unknowns.statements, 6 * windows.channels
-    if not n:
-        return np.zeros((len(records), 0, 0))
-    merged, stretch = _merged(records)
-    priors = [s.of(r.reference) for r in records]
-    u_lag_s = [max(p.lag_window_s, r.u_lag_s) * (p.lag_s > 0.0) for p, r in zip(priors, records, strict=True)]
-    u = np.array([u_lag_s, [r.attenuation for r in records]]).T / np.sqrt(merged)[:, None]
-    loaded = np.array([r.loadings for r in records]).mT * u[:, None]
-    white = _white(noise.slopes, records)
-    # What nobody knows of S along directions that were not excited, by the little that moved there.
-    unknown = np.minimum(s.u[:9], FLAT * s.scale).reshape(3, 3)
-    silent = windows.moved @ (np.eye(3) - windows.stack.excited)
-    missed = (np.sqrt(silent**2 @ unknown.T**2) / windows.stack.noise[:, None]).reshape(len(records), n)
-    covariance = white[:, None, None] * np.eye(n) + missed[..., None] ** 2 * np.eye(n) + loaded @ loaded.mT
-    if stretch.any():
+class _Slopes:
+    """By what the slopes of W windows are multiplied, so that their covariance is one: `weights` (W, 6M, 6M)."""
+
+    def __init__(self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise) -> None:
+        s, n, own = unknowns.statements, 6 * windows.channels, windows.stack
+        merged, self._stretch = _merged(records)
+        priors = [s.of(r.reference) for r in records]
+        u_lag_s = [max(p.lag_window_s, r.u_lag_s) * (p.lag_s > 0.0) for p, r in zip(priors, records, strict=True)]
+        u = np.array([u_lag_s, [r.attenuation for r in records]]).T / np.sqrt(merged)[:, None]
+        self._loaded = np.array([r.loadings for r in records]).mT * u[:, None]
+        self._white = _white(noise.slopes, records)
+        # What nobody knows of S along directions that were not excited, by the little that moved there.
+        unknown = np.minimum(s.u[:9], FLAT * s.scale).reshape(3, 3)
+        silent = windows.moved @ (np.eye(3) - own.excited)
+        self._missed = (np.sqrt(silent**2 @ unknown.T**2) / own.noise[:, None]).reshape(len(records), n)
         walks = np.sqrt(unknowns.a_day[[0, 4, 8]])
-        each = windows.moved[:, :, None, :] * walks[:, None] / windows.stack.noise[:, None, :, None]
-        for i in range(3):
-            covariance[:, i::3, i::3] += stretch[:, None, None] * (each[:, :, i] @ each[:, :, i].mT)
-    inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-    return np.asarray(inverse / np.tile(windows.stack.noise, n // 3)[:, None])
+        self._walked = windows.moved[:, :, None, :] * walks[:, None] / own.noise[:, None, :, None]
+        self._noise = np.tile(own.noise, n // 3)
+        self.weights = self._inverse() / self._noise[:, None] if n else np.zeros((len(records), 0, 0))
+
+    def _inverse(self) -> Array:
+        """(W, 6M, 6M) that of the root of the covariance, in units of the noise of a point."""
+        one = np.eye(self._missed.shape[1])
+        covariance = self._white[:, None, None] * one + self._missed[..., None] ** 2 * one
+        covariance = covariance + self._loaded @ self._loaded.mT
+        if self._stretch.any():
+            for i in range(3):
+                each = self._walked[:, :, i]
+                covariance[:, i::3, i::3] += self._stretch[:, None, None] * (each @ each.mT)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    def shares(self, gains: Array) -> dict[str, Array]:
+        """By source, of the variances of m quantities that move by `gains` (W, 6M, m) with the weighted slopes."""
+        moved = (self.weights.mT @ gains) * self._noise[..., None]
+        by_load = (self._loaded.mT @ moved) ** 2
+        by_walk = sum(((self._walked[:, :, i].mT @ moved[:, i::3]) ** 2).sum(axis=1) for i in range(3))
+        return {
+            TYPE_A: np.einsum("w,wrm->m", self._white, moved**2), LAGS: by_load[:, 0].sum(axis=0),
+            CORRECTION: by_load[:, 1].sum(axis=0), UNSEEN: ((self._missed[..., None] * moved) ** 2).sum(axis=(0, 1)),
+            WALK: self._stretch @ by_walk,
+        }  # fmt: skip
 
 
-def _mean_weights(
-    records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise, degrees: Degrees
-) -> Array:
-    """(W, 3k, 3k) by what the means of W windows are multiplied, so that their covariance is one; 0 where nobody stated
-    gravity."""
-    s, k = unknowns.statements, windows.stack.means.shape[1]
-    merged, stretch = _merged(records)
-    white = _white(noise.means, records)[:, None] * windows.stack.noise**2
-    white *= (merged / np.array([r.count for r in records]))[:, None]
-    between = np.array([(s.of(r.reference).offset_mps2 * s.scale) ** 2 for r in records])[:, None] + np.zeros(3)
-    walked = unknowns.a_day[9:] + np.outer(np.linalg.norm(windows.gravity, axis=1) ** 2, unknowns.a_day[[0, 4, 8]])
-    between = between + (stretch * merged)[:, None] * walked
-    covariance = (white + between)[..., None] * np.eye(3)
-    covariance = covariance + np.where(windows.told_degc[:, None, None], 0.0, degrees.covariance)
-    inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-    inverse = np.where(windows.known[:, None, None], inverse, 0.0)
-    return np.asarray(np.einsum("ab,wij->waibj", np.eye(k), inverse).reshape(len(records), 3 * k, 3 * k))
+class _Means:
+    """By what the means of W windows are multiplied, so that their covariance is one: `weights` (W, 3k, 3k); 0 where
+    nobody stated gravity."""
+
+    def __init__(
+        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise, degrees: Degrees
+    ) -> None:
+        s, k = unknowns.statements, windows.stack.means.shape[1]
+        merged, stretch = _merged(records)
+        self._white = _white(noise.means, records)[:, None] * windows.stack.noise**2
+        self._white *= (merged / np.array([r.count for r in records]))[:, None]
+        between = np.array([(s.of(r.reference).offset_mps2 * s.scale) ** 2 for r in records])
+        self._between = between[:, None] + np.zeros(3)
+        walked = unknowns.a_day[9:] + np.outer(np.linalg.norm(windows.gravity, axis=1) ** 2, unknowns.a_day[[0, 4, 8]])
+        self._walked = (stretch * merged)[:, None] * walked
+        self._degrees = np.where(windows.told_degc[:, None, None], 0.0, degrees.covariance)
+        covariance = (self._white + (self._between + self._walked))[..., None] * np.eye(3)
+        covariance = covariance + self._degrees
+        inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+        inverse = np.where(windows.known[:, None, None], inverse, 0.0)
+        self.weights = np.einsum("ab,wij->waibj", np.eye(k), inverse).reshape(len(records), 3 * k, 3 * k)
+
+    def shares(self, gains: Array) -> dict[str, Array]:
+        """By source, of the variances of m quantities that move by `gains` (W, 3k, m) with the weighted means."""
+        moved = (self.weights.mT @ gains).reshape(len(gains), -1, 3, gains.shape[2])
+        square = (moved**2).sum(axis=1)
+        found = {TYPE_A: self._white, OFFSETS: self._between, WALK: self._walked}
+        shares = {source: np.einsum("wi,wim->m", variance, square) for source, variance in found.items()}
+        return shares | {TEMPERATURE: np.einsum("wkim,wij,wkjm->m", moved, self._degrees, moved)}
 
 
 def _white(ratio: float, records: Sequence[Record]) -> Array:

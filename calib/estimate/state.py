@@ -27,6 +27,7 @@ from calib.estimate.record import Record, together
 from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
 from calib.estimate.rows import Noise
+from calib.estimate.sources import Sources
 from calib.estimate.statements import DOUBT, Dated, Statements, Step
 from calib.estimate.thinning import thinned
 from calib.estimate.wander import TemperatureModel, Wander
@@ -111,7 +112,7 @@ class State:
         places = {reference: met.place for reference, met in self._met.items()}
         return Statements(
             self._mean, self._u, priors, self._wander, self._temperature, places, certified, tuple(self._steps),
-            tuple(self._dated), self._held_mps2 if self._fixed else None,
+            tuple(self._dated), self._held_mps2 if self._mean_is_held else None,
         )  # fmt: skip
 
     def estimate(self, noise: Noise | None = None, also: Sequence[float] = ()) -> Estimate:
@@ -150,9 +151,14 @@ class State:
         rows = ahead.rows(trial._directed(record), at)
         return ahead.says(rows), trial, ahead, rows
 
+    @property
+    def _mean_is_held(self) -> bool:
+        """Whether the mean output of a fixed mount stands in the place of Q."""
+        return self._fixed and self._held_mps2 is not None
+
     def _directed(self, record: Record) -> Record:
         """A window with the directions that it excites, as all windows until now tell them."""
-        return together([*self._records, record], fixed=self._fixed)[-1] if record.planar else record
+        return together([*self._records, record], fixed=self._mean_is_held)[-1] if record.planar else record
 
     def _key(self, name: str) -> str:
         """The key of an unknown of the sensor, its mount, or the reference in use by its name or its key."""
@@ -210,7 +216,7 @@ class State:
     @property
     def unexcited(self) -> Array:
         """(k, 3) directions in the sensor's frame, orthonormal, in which no window moved."""
-        moved = np.sum([r.excited for r in together(self._records, fixed=self._fixed)], axis=0)
+        moved = np.sum([r.excited for r in together(self._records, fixed=self._mean_is_held)], axis=0)
         size, ways = np.linalg.eigh(moved) if self._records else (np.zeros(3), np.eye(3))
         return np.asarray(ways.T[size <= STILL * size[-1]])
 
@@ -304,6 +310,15 @@ class State:
                 changes.append(Change(after, stated[after], *self._change_of(then)))
         windows = [counts[day] for day in days]
         return Past(whole.days, laws[::-1], windows, changes[::-1], begin, self.coverage_factor)
+
+    def budget(self, whole: Estimate | None = None) -> Sources:
+        """What makes U of S and Q by a solution of the whole; None: it is solved anew."""
+        whole = whole or self.estimate()
+        now, by = whole.now, np.eye(12, len(whole.unknowns))
+        if (under_gravity := self._under_gravity(now)) is not None:
+            by[9:] -= under_gravity[1]
+        beside = self._over.budget(now, self.reference, self._priors[0], by)
+        return Sources.of(whole.budget(by) | beside, now.noise.degrees_of_freedom or np.inf, now.coverage_factor)
 
     def _change_of(self, then: Then) -> tuple[Array, Array]:
         """By how much S and Q changed (12,) from an epoch to the next one, and the standard uncertainties."""
@@ -428,21 +443,22 @@ class State:
         ahead = self._know(record)
         self._take(record, ahead, ahead.rows(self._directed(record)))
 
-    def close_day(self, day: float) -> bool:
-        """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns
-        whether that was done."""
+    def close_day(self, day: float) -> Estimate | None:
+        """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns the
+        solution; None where the day is not over."""
         if self._newest_day is None or np.floor(day) <= self._newest_day:
-            return False
+            return None
         self._newest_day = int(np.floor(day))
         cuts = [step.day for step in self._steps if any(not key.startswith("lag") for key in step.u)]
-        records = together(self._records, fixed=self._fixed)
+        records = together(self._records, fixed=self._mean_is_held)
         self._records = _newest(thinned(records, day, self._now.mean[:9].reshape(3, 3), cuts))
-        self.solve()
-        return True
+        return self.solve()
 
-    def solve(self) -> None:
+    def solve(self) -> Estimate:
         """Everything anew, from the records and the statements."""
-        self._now = self.estimate().now
+        whole = self.estimate()
+        self._now = whole.now
+        return whole
 
     def beyond(self, base: State) -> tuple[list[Record], list[Step]]:
         """The windows and the steps that an earlier state does not have, of which this one is a copy that went on."""

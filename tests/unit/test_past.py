@@ -13,7 +13,7 @@ from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Array
 from tests.building_windows import building_window
-from tests.clamp_windows import Q_TRUE, S_TRUE
+from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE
 from tests.unit.test_estimate import MEAN, STILL, U
 
 DAYS = (0.0, 1.0, 2.5, 2.6, 17.0, 18.0, 18.5)
@@ -21,15 +21,15 @@ WALKS = {"sensitivity": 2e-3, "offset_mps2": 0.02, "offset_rate_mps2": 1e-3}
 U_STEP, STEP_DAY = 0.1, float(np.nextafter(DAYS[3], np.inf))
 
 
-def filled(seed: int, *, fixed: bool = False) -> State:
-    """S_yy steps by 3 % between the fourth and the fifth window."""
+def filled(seed: int, *, fixed: bool = False, stepped: str = "Syy") -> State:
+    """An element of S steps by 3 % of S_yy between the fourth and the fifth window."""
     random, S = np.random.default_rng(seed), S_TRUE.copy()
     wander = Wander(dict(STILL.values) | WALKS)
     state = State(MEAN, U, Priors(), wander, TemperatureModel(), fixed=fixed)
     for k, day in enumerate(DAYS):
         if k == 4:
-            S[1, 1] *= 1.03
-            state.step({"Syy": U_STEP})
+            S[np.unravel_index(PARAMETERS.index(stepped), (3, 3))] += 0.03 * S_TRUE[1, 1]
+            state.step({stepped: U_STEP})
         state.update(Record.of(building_window(random, level_mps2=(0.1, 0.1, 0.1), S=S), day))
     return state
 
@@ -109,8 +109,18 @@ def test_epochs_stand_at_windows_on_both_sides_of_a_change_and_within_long_gaps(
     assert dict(zip(past.days.tolist(), past.windows, strict=True)) == {
         day: int(day in DAYS) for day in past.days.tolist()
     }
-    moved = [law.mean[4] for law in past.laws[3:5]]
-    assert moved[1] - moved[0] == pytest.approx(past.changes[0].found[4], abs=1e-9)
+
+
+@pytest.mark.parametrize("stepped", ["Syy", "Syz"])
+def test_a_change_is_the_difference_of_both_sides(stepped: str) -> None:
+    """Of a fixed mount, whose mean output stays: with S_yz, along which gravity acts, Q_y changes as well."""
+    past = filled(2, fixed=True, stepped=stepped).past()
+    (change,), sides = past.changes, past.laws[3:5]
+    np.testing.assert_allclose(change.found, sides[1].mean - sides[0].mean, rtol=0, atol=1e-6)
+    k = PARAMETERS.index(stepped)
+    assert change.found[k] == pytest.approx(0.03 * S_TRUE[1, 1], abs=3.0 * change.standard_uncertainty[k])
+    ratio = change.standard_uncertainty[10] / change.standard_uncertainty[k]
+    assert ratio == pytest.approx(G_MPS2 if stepped == "Syz" else 0.0, rel=1e-2, abs=1e-6)
 
 
 def test_between_two_epochs_it_is_on_their_line_as_an_epoch_there_would_be() -> None:

@@ -14,10 +14,15 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.core.memory import Memory
+from agent.core.past import KnownPast
 from agent.core.snapshot import pack, unpack
 from agent.delivery.history import FILE_NAME, History
 from agent.delivery.schema import write_memory
 from agent.delivery.store import Store
+from agent.export.smoothing import Smoothed
+from agent.report.material import gather
+from calib.estimate.correction import Law
+from calib.estimate.past import Past
 from calib.model import PARAMETERS
 from tests.unit.recorded_bench import EPOCH_NS, record
 
@@ -120,6 +125,28 @@ def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     assert set(columns["calibration"].tolist()) == {0, *found.values()}
 
 
+def test_samples_between_two_epochs_are_corrected_by_what_is_between_their_values() -> None:
+    """S grows by 2 % and Q by 1 m/s2 in a day; S and Q depend on the temperature as well."""
+    sides = ((1.0, 0.0), (1.02, 1.0))
+    laws = [Law(np.append(size * np.eye(3).ravel(), [Q] * 3 + [0.1] * 3), np.eye(15), 1) for size, Q in sides]
+    past = Past(np.array([5.0, 6.0]), laws, (1, 1), (), 5.0, 2.0)
+    known = KnownPast("mems", "mems A", "A", "m/s2", past, "", 6.0, EPOCH_NS)
+    smoothed, hour_ns = Smoothed({"A": known}, {"B": "B has none"}), 3600 * 10**9
+    V = np.array([[2.02, 1.01, 0.0]])
+    a, why = smoothed.acceleration("A", V, EPOCH_NS - 12 * hour_ns, 22.0)
+    assert why == ""
+    assert a is not None
+    np.testing.assert_allclose(a, (V - 0.5 - 0.2) / 1.01, rtol=1e-12)
+    for hours, (size, Q) in ((-24.5, sides[0]), (0.9, sides[1])):
+        a, _ = smoothed.acceleration("A", V, EPOCH_NS + round(hours * hour_ns), None)
+        np.testing.assert_allclose(a, (V - Q) / size, rtol=1e-12)
+    a, why = smoothed.acceleration("A", V, EPOCH_NS + 61 * hour_ns // 60, None)
+    assert a is None
+    assert "more than an hour before the first window (2026-09-20T14:13:20Z) or after the last one" in why
+    assert smoothed.acceleration("B", V, EPOCH_NS, None) == (None, "B has none")
+    assert smoothed.acceleration("C", V, EPOCH_NS, None) == (None, "no state is kept of the device C")
+
+
 def test_the_kept_state_tells_the_past_beside_a_running_agent(
     kept: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -211,3 +238,29 @@ def test_what_cannot_be_corrected_is_refused_with_a_remedy(
     status, _, err = run(capsys, "export", kept / RECORDING, "-o", to, "--data-dir", kept)
     assert status == 2
     assert "--data-dir names the windows for --corrected" in err
+
+
+def test_show_and_report_say_what_makes_u(kept: Path, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sensor = json.loads(run(capsys, "show", "--data-dir", kept, "--json", "-")[1])["sensors"]["mems"]
+    budget, update = sensor["budget"], sensor["calibration"]
+    squares = np.sum(np.square(list(budget["standard_uncertainty"].values())), axis=0)
+    np.testing.assert_allclose(np.sqrt(squares), update["standard_uncertainty"], rtol=0.01)
+    assert budget["coverage_factor"] == update["coverage_factor"]
+    line = next(line for line in run(capsys, "show", "--data-dir", kept)[1].splitlines() if "type A" in line[:9])
+    U = [2.0 * u for u in budget["standard_uncertainty"]["type A"]]
+    np.testing.assert_allclose([float(cell) for cell in line.split()[2:]], np.array(U)[[0, 4, 8, 9, 10, 11]], rtol=0.08)
+    material = gather([kept], None)
+    assert dict(material.results[0].budget).keys() == budget["standard_uncertainty"].keys()
+    assert any("that of all kept windows, solved anew" in notice for notice in material.notices)
+
+    def rolled_back(state: bytes) -> bytes:
+        held = unpack(state)
+        held["in_force"]["made_sequence"] = held["in_force"]["sequence"] = 1
+        return pack(held)
+
+    change_memory(copied, rolled_back)
+    assert (
+        "what makes U is not known: S and Q in force are not those of the newest windows"
+        in run(capsys, "show", "--data-dir", copied)[1]
+    )
+    assert not gather([copied], None).results[0].budget
