@@ -290,6 +290,11 @@ class State:
         told, u_beyond = self._determined(mean[:12], covariance[:12, :12]), temperature.u_offset_mps2[1] * self.scale
         return Law(mean, covariance, order, rows, self.reference_temperature_degc, low, high, u_beyond, told)
 
+    @property
+    def _moving_steps(self) -> list[Step]:
+        """Those of more than a lag: S and Q may have moved."""
+        return [step for step in self._steps if any(not key.startswith("lag") for key in step.u)]
+
     def past(self) -> Past:
         """S and Q of all epochs by all windows; no epoch before any window."""
         if not self._records:
@@ -298,7 +303,7 @@ class State:
         for record in self._records:
             counts[record.day] += record.windows
         stated: dict[float, dict[str, float]] = {}
-        for step in self._steps:
+        for step in self._moving_steps:
             if step.day > min(counts):
                 own = stated.setdefault(step.day, {})
                 own |= {key: float(np.hypot(u, own.get(key, 0.0))) for key, u in step.u.items()}
@@ -449,7 +454,7 @@ class State:
         if self._newest_day is None or np.floor(day) <= self._newest_day:
             return None
         self._newest_day = int(np.floor(day))
-        cuts = [step.day for step in self._steps if any(not key.startswith("lag") for key in step.u)]
+        cuts = [step.day for step in self._moving_steps]
         records = together(self._records, fixed=self._mean_is_held)
         self._records = _newest(thinned(records, day, self._now.mean[:9].reshape(3, 3), cuts))
         return self.solve()

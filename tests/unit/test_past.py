@@ -123,6 +123,15 @@ def test_a_change_is_the_difference_of_both_sides(stepped: str) -> None:
     assert ratio == pytest.approx(G_MPS2 if stepped == "Syz" else 0.0, rel=1e-2, abs=1e-6)
 
 
+def test_another_lag_alone_is_no_change_of_s_and_q() -> None:
+    state = filled(5)
+    state.step({"lag": 1e-3})
+    state.update(Record.of(building_window(np.random.default_rng(6), level_mps2=(0.1, 0.1, 0.1)), 19.0))
+    past = state.past()
+    assert [change.day for change in past.changes] == [STEP_DAY]
+    assert past.days.tolist()[-2:] == [18.5, 19.0]
+
+
 def test_between_two_epochs_it_is_on_their_line_as_an_epoch_there_would_be() -> None:
     state = filled(3)
     past, day = state.past(), 9.9
