@@ -13,7 +13,6 @@ import numpy as np
 from agent.calibrate.origin import SourceFile, source_file
 from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
-from agent.core.memory import Memory
 from agent.core.outcome import with_budget
 from agent.core.past import PastError, budget_in_force
 from agent.delivery.calibrations import calibrations, made
@@ -137,9 +136,19 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     recorded.status = status.result if status and isinstance(status.result, StatusChange) else recorded.status
     updates = [record.result for record in kept if isinstance(record.result, CalibrationUpdate)]
     newest = [in_force.result] if in_force and isinstance(in_force.result, CalibrationUpdate) else []
-    newest, told = _with_budget(newest, memories)
+    missing, facts = list[str](), dict[str, Any]()
+    if newest and not newest[0].budget:
+        try:
+            found = budget_in_force(newest[0], memories)
+            ratio = found.standard_uncertainty / np.array(newest[0].standard_uncertainty)
+            newest = [with_budget(newest[0], found)]
+            times = f"{ratio.min():.4f} to {ratio.max():.4f} times u in force"
+            facts["uncertainty budget"] = f"of all kept windows, solved anew; its u is {times}"
+        except PastError as error:
+            missing.append(f"the uncertainty budget is not known: {error}")
     material = _of(recorded, windows, newest)
-    material.notices += told
+    material.notices += missing
+    material.facts |= facts
     material.history = updates
     material.files = [source_file(path) for path in paths]
     material.notices += said
@@ -147,22 +156,6 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
         f"the recording {name} does not exist any more, so its windows are not shown point by point" for name in lost
     ]
     return material
-
-
-def _with_budget(
-    newest: Sequence[CalibrationUpdate], memories: Sequence[Memory]
-) -> tuple[list[CalibrationUpdate], list[str]]:
-    """The calibration in force with what makes its U, and what is to be said of that."""
-    for update in newest:
-        if not update.budget:
-            try:
-                found = budget_in_force(update, memories)
-            except PastError as error:
-                return [update], [f"the uncertainty budget is not known: {error}"]
-            ratio = found.standard_uncertainty / np.array(update.standard_uncertainty)
-            said = "the uncertainty budget is that of all kept windows, solved anew; its u is {:.3f} to {:.3f} times u"
-            return [with_budget(update, found)], [said.format(ratio.min(), ratio.max())]
-    return list(newest), []
 
 
 def _run_of(history: History, sensor: str, in_force: Record | None) -> str:

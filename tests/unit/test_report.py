@@ -110,10 +110,12 @@ def check_alone(seen: Page) -> None:
 def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     directory, truth = recorded
     assert run(capsys, directory, "-o", tmp_path / "out") == (0, "")
-    check_figures(tmp_path / "out", "rows", "main", "transverse", "response", "indications", "residuals", "windows")
+    names = "rows", "main", "transverse", "budget", "response", "indications", "residuals", "windows"
+    check_figures(tmp_path / "out", *names)
     seen = Page(tmp_path / "out" / "report.html")
     check_alone(seen)
     for words in (
+        "of all kept windows, solved anew; its u is 1.000",
         "Calibration of mems", "VALID", "Method 3 (recursive adjustment)",
         "count/(m/s²)", "fieldcal-000001.mcap", "θ 35°",
         "combined", "SHA-256", "mems-1", "Covariance", "beside a reference accelerometer",
@@ -136,6 +138,10 @@ def test_a_recording_gives_the_same_calibration_and_a_torn_one_what_it_has(
 ) -> None:
     source = recorded[0] / "fieldcal-000001.mcap"
     whole, directory = numbers(source), numbers(recorded[0])
+    # Only a data directory has the state from which the budget follows.
+    of_state = [directory["results"][0].pop(name) for name in ("budget", "degrees_of_freedom")]
+    assert all(of_state)
+    assert [whole["results"][0].pop(name) for name in ("budget", "degrees_of_freedom")] == [{}, None]
     assert whole["results"] == directory["results"]
     assert whole["residuals"] == directory["residuals"]
     assert len(whole["residuals"]) == 3
