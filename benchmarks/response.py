@@ -238,7 +238,7 @@ def one_inside(job: tuple[str, int, int]) -> tuple[str, float]:
     Where a refusal says that the data would be accepted with flat filters, they are stated."""
     name, skirts, seed = job
     random = np.random.default_rng([29, [*INSIDE].index(name), skirts, seed])
-    made = pair(seed, band_hz=INSIDE_BAND_HZ, rate_hz=100.0, seconds=120.0, skirts=skirts, **INSIDE[name](random))
+    made = pair(seed, band_hz=INSIDE_BAND_HZ, rate_hz=100.0, seconds=60.0, skirts=skirts, **INSIDE[name](random))
     at_hz = Priors(reference=U_REFERENCE, reference_frequency_hz=made.reference_frequency_hz)
     outcome, told = adjusted(made.files, at_hz), "valid at once"
     if outcome.reasons and "--sensor-filter flat" in outcome.reasons[-1]:
