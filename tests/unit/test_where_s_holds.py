@@ -78,7 +78,7 @@ def test_s_at_a_stated_frequency_stays_there() -> None:
     assert "S holds at 7.8 Hz" in found.where_it_holds
 
 
-def tones(u_reference_pct: float) -> Outcome:
+def tones(u_reference_pct: float, **stated: Any) -> Outcome:
     """Motion of 3 Hz and 9 Hz, along one axis after the other."""
     random, stamps, given, poses = np.random.default_rng(0), [], [], []
     S = np.eye(3) + 0.02 * random.normal(size=(3, 3))
@@ -91,7 +91,12 @@ def tones(u_reference_pct: float) -> Outcome:
         poses.append({"start_s": t[0], "stop_s": t[-1], "dx": along[0], "dy": along[1], "dz": along[2]})
     t, rows = np.concatenate(stamps), np.concatenate(given)
     return calibrate(
-        (t, rows[:, :3]), {"time_s": t, "a": rows[:, 3]}, poses, coupling="ac", u_reference_pct=u_reference_pct
+        (t, rows[:, :3]),
+        {"time_s": t, "a": rows[:, 3]},
+        poses,
+        coupling="ac",
+        u_reference_pct=u_reference_pct,
+        **stated,
     )
 
 
@@ -116,6 +121,12 @@ def test_s_at_0_hz_is_printed_beside_another_frequency() -> None:
     steady = found.more["sensitivity_at_0hz"]["sensitivity"]
     assert "S holds at 3.64 Hz" in repr(found)
     assert f"at 0 Hz: Sxx {steady[0, 0]:.4f} ± " in repr(found)
+
+
+def test_a_stated_band_leaves_the_motion_beyond_it_out() -> None:
+    found = tones(0.1, band_hz=(1.0, 5.0))
+    assert found.reference_frequency_hz == pytest.approx(3.0, abs=0.05)
+    assert "only motion from 1 to 5 Hz was used" in repr(found)
 
 
 def weak(known: KnownResponse) -> tuple[Pair, Outcome]:
