@@ -144,6 +144,7 @@ def pair(
     disturbed: Disturbance = undisturbed,
     reference_late_s: float = 0.0,
     stated_noise_mps2: float = 0.0,
+    skirts: int = 0,
 ) -> Pair:
     """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative.
 
@@ -151,13 +152,16 @@ def pair(
     axes (F,) or by axis (3, F).
     `known`: what is stated of the filters, whatever they are. `disturbed`: what is added to both signals. The samples
     of the reference are taken `reference_late_s` after those of the sensor. `stated_noise_mps2`: what is stated of its
-    noise.
+    noise. `skirts`: the order of the Butterworth filters at both ends of `band_hz` that shape the motion; 0 lets it end
+    there.
     """
     random = np.random.default_rng(seed)
     n = int((seconds + 2.0 * BEYOND_S) * rate_hz)
     frequency_hz = np.fft.rfftfreq(n, 1.0 / rate_hz)
     frequency_hz[0] = 1e-9
-    moved = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    moved = np.asarray((frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1]), dtype=float)
+    if skirts:
+        moved = np.abs(highpass(band_hz[0], skirts)(frequency_hz) * lowpass(skirts, band_hz[1])(frequency_hz))
     lines = (random.normal(size=(3, len(moved))) + 1j * random.normal(size=(3, len(moved)))) * moved
     lines *= level_mps2 / np.fft.irfft(lines, n).std()
     middle_hz = float(np.sqrt(band_hz[0] * band_hz[1]))

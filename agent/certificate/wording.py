@@ -124,6 +124,8 @@ def _conditions(c: Certificate) -> Iterator[tuple[str, str]]:
     if band is not None and at is not None:
         low, high = band
         yield "frequencies", f"S at {at:.3g} Hz; right within U/3 from {low:.3g} to {high:.3g} Hz"
+    elif at == 0.0:
+        yield "frequencies", "S at 0 Hz, as rests tell it"
     elif c.frequency_hz:
         yield "frequencies", f"mean frequency of the motion {c.frequency_hz[0]:.3g} to {c.frequency_hz[1]:.3g} Hz"
     if c.levels_mps2:

@@ -109,6 +109,8 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
     help="The frequency at which S holds. Default: the geometric middle of the motion's band.",
 )
 @click.option("--all", "everything", is_flag=True, help="Print the nuisances too: lag, angles, response and others.")
+@click.option("--band-hz", type=(Finite(min=0), Finite(min=0, min_open=True)), metavar="LOW HIGH",
+              help="Limit sensor and reference to this band. Default: the widest that fits.")  # fmt: skip
 @click.option("--plain", is_flag=True, help="Method 3 exactly as in the paper, without nuisances.")
 @click.option(
     "--json", "json_to", type=click.Path(path_type=Path, allow_dash=True, dir_okay=False, writable=True),

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from calib.estimate.nuisances import Priors
 
 PER_OCTAVE = 3  # bands in which S is reported
-LARGE = 0.5  # of the largest element of S: the elements whose relative uncertainty counts
 GRID = 200  # frequencies at which the valid band is searched
 LEFT_U = 0.5  # standard uncertainties of ln h that may be left in the windows
 
@@ -155,9 +154,9 @@ def _spaced(low_hz: float, high_hz: float, count: int) -> Array:
 
 
 def _least_u(S: Array, covariance: Array) -> float:
-    """The smallest relative standard uncertainty of an element of S (9,); small elements count as LARGE ones."""
-    largest = float(np.abs(S).max())
-    return float((np.sqrt(np.diag(covariance)[:9]) / np.maximum(np.abs(S), LARGE * largest)).min())
+    """The smallest relative standard uncertainty of an element of S (9,): a response moves each by the same share."""
+    size = np.abs(S)
+    return float((np.sqrt(np.diag(covariance)[:9])[size > 0.0] / size[size > 0.0]).min(initial=np.inf))
 
 
 def _sensitivities(

@@ -48,7 +48,7 @@ def reasons(
         or _sign_reasons(solution, turned)
         or _unit_reasons(solution, turned)
         or _lag_reasons(solution, shares)
-        or _response_reasons(shares)
+        or response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nuisance_reasons(solution, shares.covariance)
         or nothing_determined(solution, determined)
@@ -133,13 +133,14 @@ def _lag_reasons(solution: Solution, shares: Budget) -> list[str]:
     ]
 
 
-def _response_reasons(shares: Budget) -> list[str]:
+def response_reasons(shares: Budget, most: float = MOST_BETWEEN_BANDS) -> list[str]:
+    """Whether bands of frequency deviate from one smooth response by more than the share `most`."""
     bands = shares.between_bands
-    if bands.relative_u <= MOST_BETWEEN_BANDS:
+    if bands.relative_u <= most:
         return []
     return [
         f"no smooth response over frequency explains the bands: they deviate by {bands.relative_u:.1%}, limit "
-        f"{MOST_BETWEEN_BANDS:.0%}, and most of it comes from {bands.at_hz:.3g} Hz; look there for a resonance, a "
+        f"{100.0 * most:.2g}%, and most of it comes from {bands.at_hz:.3g} Hz; look there for a resonance, a "
         "filter's edge, a source of noise or a loose mount, or calibrate with motion that leaves this band out"
     ]
 

@@ -21,7 +21,7 @@ from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.excitation.windows import Points, at_rest, motion_windows, rest_window, still_window
 from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
-from calib.signal.band import band_above_noise, lowpass, without_short_holes
+from calib.signal.band import band_above_noise, lowpass, without_short_holes, without_slow
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
 from calib.signal.holes import Mask
@@ -60,7 +60,7 @@ class Settings:
 
     `limits`: what a window must keep to be used. `bands`: windows with motion hold sums in bands as well, for which the
     share `taper` of them is tapered at each end. `to_hz`: both signals are limited so that no motion above it is left;
-    None leaves it.
+    None leaves it. `from_hz`: what is slower is filtered out of both likewise, but for the means; 0 leaves it.
     """
 
     limits: Limits = DEFAULT_LIMITS
@@ -68,6 +68,7 @@ class Settings:
     limit_band: bool = True
     bands: bool = False
     to_hz: float | None = None
+    from_hz: float = 0.0
     taper: float = TAPER
 
 
@@ -184,6 +185,9 @@ def aligned(
         columns = lowpass(columns, sensor_rate_hz, band_hz)
     else:
         columns[filled] = np.nan  # without a filter, a filled sample would only repeat what the others tell
+    if settings.from_hz and settings.limit_band:
+        columns = without_slow(columns, sensor_rate_hz, settings.from_hz)
+        independent = max(independent - 2.0 * settings.from_hz / sensor_rate_hz, 0.0)
     if against is not None:
         columns = against.passed(np.where(inside[:, None], columns, np.nan))  # beyond, the sensor may be turned
         independent = against.independent(FILTER_BAND * band_hz if settings.limit_band and band_hz else np.inf)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,11 +13,12 @@ from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.lag_search import correlated_lag_s, largest_omega, without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
-from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_by_band import told_by_band
 from calib.estimate.response_told import LEFT_U, ResponseTold
+from calib.estimate.verdict import MOST_BETWEEN_BANDS, response_reasons
 from calib.excitation.bands import lowest_hz, motion_band_hz
 from calib.excitation.excited import excited_together
+from calib.excitation.narrower import Band, narrower_bands
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array, Window
@@ -27,32 +28,106 @@ from calib.recorded.outcome import NuisanceValue, Outcome, nothing_used
 from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
 from calib.recorded.table import SensorTable
 from calib.recorded.tables import Tables
+from calib.rounding import from_to
+from calib.signal.known_response import known_of
 from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.stamps import clock_from_stamps
 
 METHOD = "3 (adjustment)"
 LAG_SD, LAG_PERIODS = 3.0, 3.0  # how far a lag is searched: stated standard uncertainties, periods of the motion
 LEAST_USED = 0.05  # of the points in motion
+MAIN = [0, 4, 8]  # of PARAMETERS
+HALF_OCTAVE = 2.0**0.5
 RESPONSE_TURNS = 6
+BETTER = 1.25  # times: largest u of the main sensitivities from all windows over that from rests alone
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 
-_Told = tuple[Outcome, ReferenceShare | None]
+
+class _Told(NamedTuple):
+    """An outcome and the adjustment that it tells; None where no window can be used. `narrower`: where it is refused
+    because of the response over frequency, the bands that are tried next; empty elsewhere."""
+
+    outcome: Outcome
+    found: Adjustment | None
+    narrower: tuple[Band, ...] = ()
+
+    @property
+    def fits(self) -> bool:
+        """Whether it is not refused, and its motion tells a response and each main sensitivity that it excites."""
+        if self.found is None or self.found.response is None or self.outcome.reasons:
+            return False
+        missed = self.found.grounds.solution.equations.seen & ~self.found.calibration.determined
+        return not missed[MAIN].any()
 
 
-def adjusted(tables: Tables, priors: Priors, certificate: ReferenceCertificate | None = None) -> Outcome:
-    """The outcome for these tables and priors. `certificate` is that of the reference, if it is given."""
-    outcome, share = _adjusted(tables, priors)
-    if share is None:
+def adjusted(
+    tables: Tables, priors: Priors, certificate: ReferenceCertificate | None = None, band_hz: Band | None = None
+) -> Outcome:
+    """The outcome for these tables and priors. `certificate` is that of the reference, if it is given.
+
+    Sensor and reference are limited to `band_hz`. Where it is not stated and the response over frequency leads to a
+    refusal, as at a filter's edge, narrower bands are tried (calib.excitation.narrower), from wide to narrow. The first
+    one that is not refused is used, if half an octave less tells the same. Its bands of frequency may deviate from one
+    response by the limit over the number of bands that were tried.
+    """
+    if band_hz is None:
+        told, band_hz = _in_the_widest(tables, priors)
+    else:
+        tables = tables.within(band_hz)
+        told = _adjusted(tables, priors)
+    outcome, found = _at_rest(told, priors)
+    outcome = _with_remedy(outcome, tables, priors)
+    outcome = replace(outcome, more={**outcome.more, "band_hz": band_hz})
+    if found is None or (share := found.share) is None:
         return outcome
     if certificate is not None:
         share = replace(share, sensitivity=certificate.sensitivity)
-    told = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
-    return replace(outcome, more={**outcome.more, "shared_errors": [share.told(*told)]})
+    identity = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
+    return replace(outcome, more={**outcome.more, "shared_errors": [share.told(*identity)]})
 
 
-def _adjusted(tables: Tables, priors: Priors) -> _Told:
-    """Make windows with the lag and the response over frequency taken out, and adjust them."""
-    search = _Search(tables, priors)
+def _in_the_widest(tables: Tables, priors: Priors) -> tuple[_Told, Band | None]:
+    """What is told in the widest band that is not refused, and this band; None where nothing was limited."""
+    whole = _adjusted(tables, priors)
+    for tried, band_hz in enumerate(whole.narrower, 2):
+        found = _adjusted(tables.within(band_hz), priors, MOST_BETWEEN_BANDS / tried)
+        if found.fits and _repeated(found.outcome, tables, priors, band_hz):
+            return found, band_hz
+    if not whole.narrower:
+        return whole, None
+    tried_hz = ", ".join(f"{from_to(*band_hz)} Hz" for band_hz in whole.narrower)
+    *others, last = whole.outcome.reasons
+    reasons = (*others, f"{last}; limited to narrower bands ({tried_hz}) they are refused as well")
+    return whole._replace(outcome=replace(whole.outcome, reasons=reasons)), None
+
+
+def _with_remedy(outcome: Outcome, tables: Tables, priors: Priors) -> Outcome:
+    """The outcome; where it is refused, and would not be if no response were left to the data, the last reason
+    says how to state that. Noise of a reference may look like a response that nobody can believe."""
+    if not outcome.reasons or priors.known.is_stated or len(outcome.more.get("response") or ()) < 2:
+        return outcome
+    if _adjusted(tables, priors.beside_known(known_of(["flat"], ["flat"]))).outcome.reasons:
+        return outcome
+    *others, last = outcome.reasons
+    remedy = "if no filter of sensor and reference matters in the motion's band, state --sensor-filter flat"
+    return replace(outcome, reasons=(*others, f"{last}; {remedy} --reference-filter flat: then the data are accepted"))
+
+
+def _repeated(outcome: Outcome, tables: Tables, priors: Priors, band_hz: Band) -> bool:
+    """Whether a band that is half an octave narrower tells the same S within U. What lies beyond the end of a band, as
+    a resonance or a notch, may bend a smooth response that shows no deviation; it bends that of both bands differently.
+    """
+    at_hz = {"reference_frequency_hz": outcome.reference_frequency_hz or 0.0}
+    other = _adjusted(tables.within((band_hz[0] * HALF_OCTAVE, band_hz[1] / HALF_OCTAVE)), priors.with_values(at_hz))
+    away = np.abs(other.outcome.sensitivity - outcome.sensitivity).ravel()
+    largest = np.fmax(outcome.expanded_uncertainty, other.outcome.expanded_uncertainty)[:9]
+    return other.fits and not bool(np.any(away > largest))
+
+
+def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN_BANDS) -> _Told:
+    """Make windows with the lag and the response over frequency taken out, and adjust them. Bands may deviate from one
+    response by `most_between`."""
+    search = _Search(tables, priors, most_between)
     applied = search.begin()
     refused = None if _used(search.windows) else search.windows
     first: tuple[Adjustment, float] | None = None
@@ -67,9 +142,10 @@ def _adjusted(tables: Tables, priors: Priors) -> _Told:
             return told
         applied = told
     if refused is not None and not _used(search.windows):
-        return nothing_used(refused, tables.rate_hz, METHOD), None
+        narrower = search.of_any_response(applied.lag_s)
+        return _Told(nothing_used(refused, tables.rate_hz, METHOD), None, narrower)
     more = {} if first is None else _response(search.by_band(*first))
-    return Outcome(None, (UNSETTLED,), search.windows, tables.rate_hz, METHOD, more=more), None
+    return _Told(Outcome(None, (UNSETTLED,), search.windows, tables.rate_hz, METHOD, more=more), None, search.narrower)
 
 
 def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_hz: float) -> _Told | Applied:
@@ -77,25 +153,29 @@ def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_h
     windows, found = search.windows, search.at(search.windows, applied)
     if not search.stated.response:
         found = _attenuated(found, windows, priors, applied)
-        return _outcome(found, windows, rate_hz), found.share
+        return _Told(_outcome(found, windows, rate_hz), found)
     told = found.response
     left_u = LEFT_U if turn <= HOPELESS else 2.0 * LEFT_U  # noisy windows change a little with the response, to and fro
     if not (told is None or told.is_taken_out(applied.response, left_u) or (turn >= HOPELESS and found.reasons)):
         return replace(applied, response=_next_response(told.terms, applied.response))
-    outcome = _outcome(found, windows, rate_hz)
+    deviates = response_reasons(found.grounds.shares, search.most_between)
+    outcome = _outcome(found, windows, rate_hz, deviates)
     if outcome.calibration is None:
         outcome = replace(outcome, more={**outcome.more, **_response(search.by_band(found, applied.lag_s))})
-    return outcome, found.share
+    narrower = search.narrower if deviates and outcome.reasons == tuple(deviates) else ()
+    return _Told(outcome, found, narrower)
 
 
 class _Search:
     """Adjustments of the windows of tables from which a lag and a response are taken out.
 
     `windows`: those made last; of a day they need so much memory that they go before others are made. `stated` are the
-    priors, later with those of the response, whose scale is that of the motion.
+    priors, later with those of the response, whose scale is that of the motion. `narrower`: bands in which the motion
+    may be used instead. `most_between`: how far bands may deviate from one response.
     """
 
-    def __init__(self, tables: Tables, priors: Priors) -> None:
+    def __init__(self, tables: Tables, priors: Priors, most_between: float) -> None:
+        self.most_between, self.narrower = most_between, tuple[Band, ...]()
         self._tables, self._priors = tables, priors.beside_unknown_corner if tables.corner_unknown else priors
         self.stated = self._priors
         self.windows: list[Window] = []
@@ -122,6 +202,7 @@ class _Search:
         """The adjustment of windows from which this was taken out; the latest one is kept."""
         if not self.stated.response and (told := with_response(self._priors, windows)).response:
             self.stated, self._latest = told, None
+            self.narrower = narrower_bands(_used(windows), self._priors.reference_frequency_hz)
         if self._latest is None or self._latest[0] is not windows or self._latest[1] != taken:
             self._latest = windows, taken, adjust(_used(windows), self.stated, taken)
         return self._latest[2]
@@ -130,6 +211,11 @@ class _Search:
         """The response as each band tells it by itself, where no smooth one is right; `found` is of windows from which
         this lag was taken out."""
         return told_by_band(found, self._tables.of_any_response(lag_s))
+
+    def of_any_response(self, lag_s: float) -> tuple[Band, ...]:
+        """`narrower` where no window can be used: perhaps because of what the response makes of the motion."""
+        windows = _used(self._tables.of_any_response(lag_s))
+        return narrower_bands(windows, self._priors.reference_frequency_hz)
 
     def make(self, taken: Applied, *, steady: bool = True) -> Applied:
         """Make windows from which this response is taken out and whatever lag they show; returns both."""
@@ -200,6 +286,24 @@ def _attenuated(found: Adjustment, windows: Sequence[Window], priors: Priors, ap
     return adjust(_used(windows), known, applied) if known.response else found
 
 
+def _at_rest(told: _Told, priors: Priors) -> tuple[Outcome, Adjustment | None]:
+    """The outcome and its adjustment: those of the rests alone, with S at 0 Hz, where they tell S better than all
+    windows do at the frequency of the motion, and nobody stated a frequency.
+
+    Motion takes no part: how far S changes from its frequency down to 0 Hz is known only where rests tell S themselves.
+    """
+    outcome, found = told.outcome, told.found
+    rests = [w for w in _used(outcome.windows) if w.kind == "rest"]
+    if outcome.reasons or found is None or found.response is None or priors.reference_frequency_hz or not rests:
+        return outcome, found
+    steady = adjust(rests, priors, found.grounds.applied)
+    u, u_at_rest = (np.nan_to_num(a.calibration.standard_uncertainty[MAIN], nan=np.inf) for a in (found, steady))
+    lost = found.calibration.determined & ~steady.calibration.determined
+    if lost.any() or not np.max(u) > BETTER * np.max(u_at_rest) or steady.reasons:
+        return outcome, found
+    return replace(_outcome(steady, outcome.windows, outcome.rate_hz), lag_s=outcome.lag_s), steady
+
+
 def _used(windows: Sequence[Window]) -> list[Window]:
     return [w for w in windows if w.used]
 
@@ -230,8 +334,9 @@ def norm_fitted(sensor: SensorTable, options: Options) -> Outcome:
     )  # fmt: skip
 
 
-def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float) -> Outcome:
-    reasons, joint = _hardly_used(windows) or found.reasons, found.joint
+def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float, deviates: Sequence[str] = ()) -> Outcome:
+    """`deviates`: why no one response explains the bands, where a limit is narrower than that of all adjustments."""
+    reasons, joint = _hardly_used(windows) or found.reasons or tuple(deviates), found.joint
     nuisances = [NuisanceValue(n.name, n.value, n.standard_uncertainty, n.unit) for n in found.nuisances]
     return Outcome(
         None if reasons else found.calibration, reasons, windows, rate_hz, found.calibration.method,

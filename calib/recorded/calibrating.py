@@ -58,7 +58,7 @@ def _estimated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
     if certificate is not None:
         options = replace(options, u_reference_pct=100.0 * float(np.max(certificate.u_relative)))
     tables = tables_of(sensor, reference, poses, options, instrument_of(options))
-    return adjusted(tables, priors_of(options), certificate)
+    return adjusted(tables, priors_of(options), certificate, options.band_hz)
 
 
 def tables_of(

@@ -32,7 +32,8 @@ class Options:
     """The options. Raises OptionError if a value is out of its range; `check` tells which do not go together.
 
     `sensor_filter`, `reference_filter`: the known filters of an instrument, each in one line of text
-    (calib.signal.known_filters); empty where nobody states any. `rotation` (3, 3): a = R a_ref. `prior`: S row by row
+    (calib.signal.known_filters); empty where nobody states any. `band_hz`: both ends of the band to which sensor and
+    reference are limited. `rotation` (3, 3): a = R a_ref. `prior`: S row by row
     and Q (12,), and their covariance (12, 12), see calib.recorded.priors.prior_of. The u of `reference_certificate`
     counts in the place of `u_reference_pct`.
     """
@@ -50,6 +51,7 @@ class Options:
     prior: tuple[Array, Array] | None = None
     reference_certificate: ReferenceCertificate | None = None
     reference_frequency_hz: float | None = None
+    band_hz: tuple[float, float] | None = None
     sensor_filter: tuple[str, ...] = ()
     reference_filter: tuple[str, ...] = ()
     reference_corner_hz: float = 0.0
@@ -87,6 +89,8 @@ class Options:
                     )
         if self.rotation is not None and np.shape(self.rotation) != (3, 3):
             raise _wrong("rotation", self.rotation, "give a matrix of 3 x 3 numbers, a = R a_ref")
+        if self.band_hz is not None and not _rises(self.band_hz):
+            raise _wrong("band_hz", self.band_hz, "give two frequencies in Hz, LOW and HIGH, with 0 <= LOW < HIGH")
         for name in (f.name for f in fields(self) if f.type in ("float", "float | None")):
             value = getattr(self, name)
             if value is not None and (remedy := _out_of_range(name, value)):
@@ -107,12 +111,21 @@ class Options:
             raise OptionError(f"`method` {self.method} needs `reference` and `poses`")
         if (self.sensor_filter or self.reference_filter) and (self.method != 3 or self.plain or not reference):
             raise OptionError("`sensor_filter` and `reference_filter` are for Method 3 with a `reference`, not `plain`")
+        if self.band_hz is not None and (self.method != 3 or self.plain or not reference):
+            raise OptionError("`band_hz` is for Method 3 with a `reference`, not `plain`")
+        at_hz = self.reference_frequency_hz
+        if self.band_hz is not None and at_hz is not None and not self.band_hz[0] <= at_hz <= self.band_hz[1]:
+            raise OptionError(f"`reference_frequency_hz` is {at_hz:g} Hz, outside `band_hz`; state one within it")
         if self.method != 3 and self.plain:
             raise OptionError("`plain` is for Method 3 only; remove `plain` or `method`")
 
 
 def _lines(given: str | Sequence[str]) -> tuple[str, ...]:
     return (given,) if isinstance(given, str) else tuple(map(str, given))
+
+
+def _rises(band_hz: Sequence[float]) -> bool:
+    return len(band_hz) == 2 and 0.0 <= band_hz[0] < band_hz[1] < math.inf
 
 
 def _out_of_range(name: str, value: Any) -> str:

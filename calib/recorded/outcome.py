@@ -111,12 +111,17 @@ class Outcome:
 
     @property
     def where_it_holds(self) -> str:
-        """The frequency at which S holds and the band in which it is right, as a sentence; "" where nothing is told."""
+        """The frequency at which S holds, why where it is 0 beside motion, the band in which S is right, and that to
+        which the motion was limited, as a sentence; "" where nothing is told."""
         if self.reference_frequency_hz is None:
             return ""
-        band = self.more.get("valid_band_hz")
+        told = f"S holds at {self.reference_frequency_hz:.3g} Hz"
+        if not self.reference_frequency_hz and any(w.used and w.kind == "motion" for w in self.windows):
+            return f"{told}, told by rests alone: motion tells it less well at its frequency (`reference_frequency_hz`)"
+        band, limited = self.more.get("valid_band_hz"), self.more.get("band_hz")
         within = f"; from {from_to(*band)} Hz it is right within a third of U" if band else ""
-        return f"S holds at {self.reference_frequency_hz:.3g} Hz{within}"
+        used = f"; only motion from {from_to(*limited)} Hz was used" if limited else ""
+        return f"{told}{within}{used}"
 
     @property
     def where_nothing_moved(self) -> str:

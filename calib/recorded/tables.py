@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,10 +29,12 @@ from calib.recorded.poses import PoseInterval
 from calib.recorded.segments import segments_joined, with_joined
 from calib.recorded.streams import TableStream
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
+from calib.signal.band import HALVED, STOP_BAND
 from calib.signal.instrument import Instrument
 from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
 
+HIGHEST_LIMIT = 0.4  # of the sampling rate: a limit above leaves nothing to remove
 GUARD_S = 0.1  # not used at both ends of a pose, because of handling and of errors of the clocks
 
 
@@ -108,6 +111,15 @@ class Tables:
                 del found  # of a day, it would need as much memory once more
                 return self._made(settings, lag_s, response, progress)
         return found
+
+    def within(self, band_hz: tuple[float, float]) -> Tables:
+        """The same with both signals limited alike to a band: half of an amplitude is left at its ends, and hardly
+        anything beyond. An end of 0, or near half the sampling rate, limits nothing."""
+        low_hz, high_hz = band_hz
+        to_hz = STOP_BAND / HALVED * high_hz if high_hz < HIGHEST_LIMIT * self.rate_hz else None
+        other = copy(self)
+        other._making = replace(self._making, settings=replace(self._making.settings, from_hz=low_hz, to_hz=to_hz))
+        return other
 
     def of_any_response(self, lag_s: float) -> list[Window]:
         """Windows that tell the response of each band by itself: no limit refuses what another response may explain,

@@ -25,6 +25,9 @@ TINY = 1e-300
 WIDEST = 0.35  # of the sampling rate: above this a filter would remove hardly any noise
 STOP_BAND_DB = 66.0
 STOP_BAND = 1.5  # times the band that the filter passes
+HALVED = 1.25  # times the band that the filter passes: where half of an amplitude is left
+# At the lower end, the length of Hann's window whose mean is subtracted twice: half of an amplitude is left there.
+SLOW_CYCLES = 1.3
 
 
 def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
@@ -116,6 +119,20 @@ def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
     taps = 2.0 * cut * np.sinc(2.0 * cut * n) * _kaiser(2 * half + 1)
     taps /= taps.sum()
     return convolved(x, taps)
+
+
+def without_slow(x: Array, rate_hz: float, from_hz: float) -> Array:
+    """x (n, k), one sample per row, through a high-pass filter without phase shift; the means of the columns stay.
+
+    Half of an amplitude is left at `from_hz`, 6 % at half of that. Rows closer than SLOW_CYCLES cycles of it to an end
+    of x, or to a NaN, are NaN.
+    """
+    half = max(1, round(0.5 * SLOW_CYCLES * rate_hz / from_hz))
+    mean = hanning(2 * half + 3)[1:-1]
+    once = -mean / mean.sum()
+    once[half] += 1.0
+    whole = np.nanmean(x, axis=0)
+    return np.asarray(convolved(x - whole, np.convolve(once, once)) + whole)
 
 
 def convolved(x: Array, taps: Array) -> Array:

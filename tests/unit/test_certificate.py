@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -17,13 +18,19 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
+from agent.certificate.content import certificate_of
 from agent.certificate.schema import SchemaError, check_schema
 from agent.certificate.signing import PURPOSE, signed_json
+from agent.certificate.statements import Statements
+from agent.certificate.wording import before_results
 from agent.cli.main import run_cli
 from agent.config.earlier import DCC, PARAMETER_LIST, SI, read_earlier
+from agent.config.reading import load_model
 from agent.core.events import CalibrationUpdate
 from agent.recording.reading import RecordingReader
 from agent.recording.signed_text import SignedText, values_of
+from agent.report.material import gather
+from agent.report.writing import left_over
 from tests.unit.certificates import content, run, stated, uneven
 from tests.unit.recorded_bench import record
 from tests.unit.test_report import Page
@@ -293,3 +300,14 @@ def test_the_dcc_is_valid_by_the_schema_of_ptb(source: str, made: Path, tmp_path
     broken = (out / "certificate.xml").read_bytes().replace(b"dcc:uniqueIdentifier", b"dcc:identifier")
     with pytest.raises(SchemaError, match="identifier"):
         check_schema(broken, schema)
+
+
+def test_s_that_rests_alone_tell_holds_at_0_hz(tmp_path: Path) -> None:
+    """Not at the mean frequency of the motion, which took no part."""
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(fields(reference_frequency_hz=0.0, valid_band_hz=None, response=None)))
+    material, told = gather([path], None), stated(tmp_path)
+    made = certificate_of(material, load_model(told, Statements), told.parent, left_over(material))
+    held = replace(made, frequency_hz=(7.8, 7.8))
+    rows = [row for section in before_results(held, "") for row in section.rows]
+    assert ("frequencies", "S at 0 Hz, as rests tell it") in rows
