@@ -83,7 +83,8 @@ class BandSums:
     in them, of which the share `independent` is statistically independent. `products` (B, 2 m + 3, 2 m + 3) are sums
     over points of products of u in m/s2, du/dt in m/s3 and V in output unit. `noise` (B, 2 m + 3) is the power of white
     noise. That of the reference was subtracted from the diagonals and is still in the residuals. That of V was not; it
-    is 0 where nothing tells it, and inf where all other noise is V's.
+    is 0 where nothing tells it, and inf where all other noise is V's. `lasting` (B,): power of the motion that is there
+    for half of the time, over its mean power.
     """
 
     reference_channels: int
@@ -93,6 +94,7 @@ class BandSums:
     independent: float
     products: Array
     noise: Array
+    lasting: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +107,7 @@ class Window:
     hardly moved; the window is not used). `numbers` are the statistics behind the verdict, each with its unit in its
     name. `u_lag_s` is the standard uncertainty of this window's own lag, as far as the two clocks show it.
     `independent` is the share of statistically independent points: below 1 after both signals were limited to a band.
+    `motion_hz`: the band of the motion that lasts, before anything was limited; None where `bands` tell it.
     """
 
     start_s: float
@@ -122,6 +125,7 @@ class Window:
     reference_noise: Array | None = None  # (2, m) rms of the reference's own noise in u, m/s2, and in du/dt, m/s3
     bands: BandSums | None = None  # None at rest, and where no response over frequency is estimated
     response: tuple[float, ...] = ()  # terms (calib.signal.response) that were taken out; () where none were
+    motion_hz: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

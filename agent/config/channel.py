@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Discriminator, FailFast, Field, Tag, model_validator
 
-from agent.config.knowledge import Certificate, Knowledge, Nine
+from agent.config.knowledge import Certificate, Knowledge, Nine, Positive
 from agent.config.pose import PoseInterval, Stop, tell_apart
 from agent.config.section import Name, Section, Vector
 from calib.geometry import UNIT_TOLERANCE
@@ -17,6 +17,7 @@ from calib.model import Pose
 # Least length of a pose after its guards are taken off. A shorter pose cannot be used, and many of them, after a typing
 # error, would fill the store.
 SHORTEST_POSE_S = 0.1
+LEAST_BAND = 2.0  # the upper end of a band over the lower one: four third octaves, as calib.excitation.bands asks for
 LEAST_LEANING_DEG = 5.0  # of a clamp, if alpha is found from gravity: 1 mg of offset is 0.7 deg of alpha there
 
 
@@ -60,6 +61,9 @@ class Channel(Knowledge):
     static_sign: Literal[1, -1] = 1
     # After a clamp was turned by hand it vibrates for about a second: half a second at each end of a pose is not used.
     guard_s: Annotated[float, Field(ge=0, le=60)] = 0.5
+    # Lowest and highest frequency of the motion from which S and the response are estimated. Motion more than a tenth
+    # above is filtered out. Left out, the first windows settle it.
+    band_hz: tuple[Positive, Positive] | None = None
     # Longest delay of samples. They are kept as long, in memory and in every snapshot: 29 MB for a minute of six axes
     # at 10 kHz.
     late_horizon_s: Annotated[float, Field(gt=0, le=60)] = 5.0
@@ -137,6 +141,26 @@ class Channel(Knowledge):
             )
         if fault := self.by_reference[1].certificate_fault:
             raise ValueError(f"check_reference: {fault}")
+        return self
+
+    @model_validator(mode="after")
+    def _band(self) -> Channel:
+        if self.band_hz is None:
+            return self
+        low_hz, high_hz = self.band_hz
+        if self.reference is None:
+            raise ValueError("band_hz is that of a motion, which needs a reference; name one, or remove band_hz")
+        if high_hz < LEAST_BAND * low_hz:
+            raise ValueError(
+                f"band_hz [{low_hz:g}, {high_hz:g}] is too narrow to tell a response over frequency; state the lower "
+                f"frequency first, and a second one that is at least {LEAST_BAND:g} times as high, or remove band_hz"
+            )
+        at_hz = self.prior.reference_frequency_hz
+        if at_hz and not low_hz <= at_hz <= high_hz:
+            raise ValueError(
+                f"prior.reference_frequency_hz {at_hz:g} is not within band_hz [{low_hz:g}, {high_hz:g}]; change one "
+                "of the two"
+            )
         return self
 
     @model_validator(mode="after")

@@ -36,7 +36,8 @@ SAME = 1e-6  # standard uncertainties: what rounding moves when the windows are 
 class Judged:
     """The result for a window: the decision of the gate, the innovation, and drift verdicts that changed.
 
-    `news` for the operator: that the time between sensor and reference has shifted; otherwise "".
+    `news` for the operator: that the time between sensor and reference has shifted, or which band and frequency are
+    settled; otherwise "".
     """
 
     decision: Decision
@@ -94,7 +95,8 @@ class Estimation:
         u = channel.prior.standard_uncertainty(mean)
         priors, *check = (beside.priors(fixed_mount=fixed) for beside in self._beside)
         walks, temperature = channel.wander(), channel.temperature_model()
-        self.state = State(mean, u, priors, walks, temperature, fixed=fixed, check=check)
+        band_hz = channel.band_hz
+        self.state = State(mean, u, priors, walks, temperature, fixed=fixed, check=check, band_hz=band_hz)
         self.in_force, self.law = self.state.result(), self.state.law()
         self.residual_sd = self.state.residual_sd
         self.gate = Gate(channel.gate.filled(self.state.scale, fixed_mount=fixed), self.in_force)
@@ -199,6 +201,7 @@ class Estimation:
             still="" if self.gate.calibrated else where_nothing_moved(trial.unexcited),
         )  # fmt: skip
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
+        earlier = self.state
         if decision.action == "take":
             self.state = trial
         elif decision.action == "adopt":
@@ -227,8 +230,11 @@ class Estimation:
                 self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
             why = self.lag_watch.beyond or most_likely(innovation, self.state.scale)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
-        news = self.lag_watch.taken(self.state) if decision.action in ("take", "adopt") else ""
-        return Judged(decision, innovation, drift, news)
+        return Judged(decision, innovation, drift, self._news(earlier) if decision.action in ("take", "adopt") else "")
+
+    def _news(self, earlier: State) -> str:
+        """What the newest window, which was taken, has changed besides S and Q."""
+        return "; ".join(filter(None, (self.lag_watch.taken(self.state), self.state.settled_since(earlier))))
 
     def explain(self, now_s: float) -> str:
         """What explains the held windows, once in each `explain_after_s` while there are any; else "".

@@ -31,7 +31,7 @@ from agent.core.snapshot import pack, unpack
 from calib.model import Pose
 
 # Settings on which the meaning of a state depends. Walks (process), gate and drift settings may change at any time.
-STATED = frozenset({"prior", "certificate", "uncertainty", "temperature", "gravity_mps2"})  # exchanged in the state
+STATED = frozenset({"prior", "certificate", "uncertainty", "temperature", "gravity_mps2", "band_hz"})  # exchanged
 MOUNT = frozenset(
     {"rotation", "rotation_gravity_mps2", "clamp_theta_deg", "poses", "positions", "fixed_mount", "check_rotation"}
 )
@@ -131,6 +131,7 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
             return Kept(Estimation(filters.channel, nominal), None, day, t_utc_ns, reason)
         size = _size(were.channel, filters.channel, fresh.state.reference_frequency_hz)
         gravity = _gravity(changed, state["basis"], configured)
+        kept_state = fresh.state.copy()
         moved = fresh.restate(gravity, remounted=bool(MOUNT & changed), size=size)
     except MALFORMED as error:
         why = f"the stored state cannot be read: {_said(error)}"
@@ -140,6 +141,8 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
         reason += f"; these settings have changed and were exchanged in the state: {', '.join(sorted(changed))}"
     if size is not None:
         reason += f"; {OTHER_FILTERS}"
+    if settled := fresh.state.settled_since(kept_state):
+        reason += f"; {settled}"
     return Kept(fresh, in_force, day, t_utc_ns, reason, moved)
 
 

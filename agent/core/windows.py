@@ -10,7 +10,7 @@ import numpy as np
 from agent.config import Channel
 from agent.core.schedule import Piece
 from agent.core.stream import DeviceStream
-from calib.excitation.bands import ABOVE, HIGHEST, share_above
+from calib.excitation.bands import ABOVE, HIGHEST, motion_band_hz, share_above
 from calib.excitation.front_end import LEAST_MARGIN_S, Settings, Unusable, margin_s, nothing_in, windows_of
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.model import Window
@@ -80,8 +80,9 @@ def windows_in(
 
     try:
         found = made(None)
-        if any(share_above(window, HIGHEST * to_hz) > ABOVE for window in found):
-            found = made(to_hz)
+        if any(share_above(window.bands, HIGHEST * to_hz) > ABOVE for window in found):
+            motion_hz = motion_band_hz(found, lasting=True)
+            found = [replace(window, motion_hz=motion_hz) for window in made(to_hz)]
     except Unusable as error:
         return Found([refused(piece, str(error))])
     if not found:

@@ -14,6 +14,7 @@ import numpy as np
 from agent.config import Channel, Config
 from agent.config.lines import Path
 from agent.config.names import Told
+from calib.signal.resampling import BAND, differentiated_band_hz
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor
 from hw.sensor import Options, load_driver
@@ -41,7 +42,27 @@ def contradictions(config: Config, options: Mapping[str, Options]) -> Iterator[T
     nominal = {device.name: nominal_of(device.driver, device.name, options[device.name]) for device in config.devices}
     for i, channel in enumerate(config.channels):
         found = [*_axes(channel, options), *_sensitivities(channel, options, nominal), *_gravity(channel)]
+        found += _band(channel, options)
         yield from ((("channels", i, *path), what) for path, what in found)
+
+
+def _band(channel: Channel, options: Mapping[str, Options]) -> Iterator[Told]:
+    """Where a stated band of motion reaches above what the rate of a device tells."""
+    if channel.band_hz is None:
+        return
+    instrument, high_hz = channel.instrument, channel.band_hz[1]
+    for name in filter(None, (channel.sensor, channel.reference)):
+        rate_hz = getattr(options[name], "rate_hz", None)
+        if rate_hz is None:
+            continue
+        differentiated = name == channel.reference and instrument.derivatives
+        most_hz = differentiated_band_hz(rate_hz) if differentiated else BAND * rate_hz
+        if high_hz > most_hz:
+            what = (
+                f"{high_hz:g} Hz is above {most_hz:g} Hz, up to which {name} tells the motion with rate_hz "
+                f"{rate_hz:g}; end the band there, or let the device send more samples"
+            )
+            yield ("band_hz",), what
 
 
 def nominal_of(driver: str, name: str, held: Options) -> float | None:

@@ -20,6 +20,7 @@ from benchmarks.online import (
     drifting,
     filters,
     harm,
+    lorries,
     references,
     touched,
     year,
@@ -76,6 +77,13 @@ def _harm(workers: int, runs: int | None) -> tuple[Path, str]:
 
 def _filters(workers: int, runs: int | None) -> tuple[Path, str]:
     return RESPONSE, filters.table(spread(filters.one, filters.jobs(runs or filters.RUNS), workers))
+
+
+def _lorries(workers: int, runs: int | None) -> tuple[Path, str]:
+    count = runs or lorries.RUNS
+    records = [(order, seed) for order in lorries.RECORDS for seed in range(count)]
+    whole = lorries.table(spread(lorries.one, lorries.jobs(count), workers))
+    return ONLINE, f"{lorries.records_table(spread(lorries.of_records, records, workers))}\n\n{whole}"
 
 
 def _chip(workers: int, runs: int | None) -> tuple[Path, str]:
@@ -160,6 +168,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "filters": _filters,
     "chip": _chip,
     "touched": _touched,
+    "lorries": _lorries,
     "drift": _drift,
     "references": _references,
     "day": _day,

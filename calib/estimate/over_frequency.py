@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Self
@@ -21,6 +21,8 @@ from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, attenua
 KNOWN = 0.03  # standard uncertainty of ln h
 LEFT_U = 1.0  # standard uncertainties of ln h that may be left in a window
 SURELY = 4.0  # standard uncertainties
+SEVERAL = 8  # windows that settle the band
+ANOTHER_OCTAVES = np.array([1.0, 1.0 / 3.0])  # two windows of one motion differ by less in their lower and upper ends
 MOVED = 1e-2  # change of ln h from which the windows must be linearised again
 # (2, 5) derivatives of ln h by the unknowns of the response, in the middle and at the upper end of the motion.
 _ENDS: Complex = by_term(np.array([0.5, 1.0]) / WIDER) * in_units(1.0 / (2.0 * np.pi))
@@ -28,15 +30,21 @@ _ENDS: Complex = by_term(np.array([0.5, 1.0]) / WIDER) * in_units(1.0 / (2.0 * n
 
 @dataclass(frozen=True, slots=True)
 class OverFrequency:
-    """`motion_hz` is the band of the first window whose motion tells a response; None before. S means the same ever
-    after: it holds at one frequency, and motion above `to_hz` is not used. `deviations` of all windows from one
-    response, and what they leave open."""
+    """`motion_hz` is the band of the motion that is used, up to `to_hz`; None before a window tells a response. It is
+    that of the first such window until several windows agree on another one, at most until `windows` of them are
+    SEVERAL; or the one that is stated (`fixed`), always. S holds at `settled_hz`, 0 before the second window with
+    motion; it then stays, whatever the band is. `left_out`: so many windows have motion above the band, and their sums
+    by band were not kept. `deviations` of all windows from one response, and what they leave open."""
 
     motion_hz: tuple[float, float] | None = None
     deviations: Deviations = field(default_factory=Deviations)
     left_open: LeftOpen = field(default_factory=LeftOpen)
     first_hz: float = 0.0  # mean frequency of the first window with motion; 0 before
     late_s: float | None = None  # the lag at this frequency, where it was the only one; None where a band told more
+    settled_hz: float = 0.0
+    windows: int = 0
+    fixed: bool = False
+    left_out: int = 0
 
     @property
     def to_hz(self) -> float:
@@ -47,24 +55,85 @@ class OverFrequency:
         """The priors with those of the response, once it is an unknown."""
         if self.motion_hz is not None and priors.response_hz == self.to_hz:
             return priors  # they have them already
+        if self.at_hz and not priors.reference_frequency_hz:
+            priors = priors.with_values({"reference_frequency_hz": self.at_hz})
         if self.late_s is not None:
             priors = priors.at_one_frequency(self.first_hz, self.late_s)
         return priors if self.motion_hz is None else priors.with_response(self.motion_hz, self.to_hz)
 
-    def begun(self, record: Record) -> Self:
-        """The same when a window comes: its motion is in a band, or has one frequency."""
-        if self.motion_hz is not None:
-            return self
+    def begun(self, record: Record, before: Sequence[Record]) -> Self:
+        """The same when a window comes after those of `before`: its motion is in a band, or has one frequency."""
+        over = self
         if record.motion_hz is not None:
-            return replace(self, motion_hz=record.motion_hz, first_hz=self.first_hz or record.mean_hz)
-        if self.late_s is None and record.mean_hz:
-            return replace(self, first_hz=record.mean_hz, late_s=record.lag_s)
-        return self
+            over = self._settled([*before, record])
+            over = replace(over, first_hz=self.first_hz or record.mean_hz)
+        elif self.motion_hz is None and self.late_s is None and record.mean_hz:
+            over = replace(self, first_hz=record.mean_hz, late_s=record.lag_s)
+        if over.settled_hz or not record.mean_hz or not any(one.mean_hz for one in before):
+            return over
+        return replace(over, settled_hz=over.at_hz)
+
+    def _settled(self, records: Sequence[Record]) -> Self:
+        """With the band of these windows, until they are SEVERAL."""
+        if self.fixed or self.windows >= SEVERAL:
+            return self
+        low_hz, high_hz, windows = common_band(records)
+        if self.motion_hz is not None:
+            away = np.abs(np.log2([low_hz / self.motion_hz[0], high_hz / self.motion_hz[1]]))
+            if (away <= ANOTHER_OCTAVES).all():
+                return replace(self, windows=windows)
+        return replace(self, motion_hz=(low_hz, high_hz), windows=windows)
+
+    @property
+    def at_hz(self) -> float:
+        """The frequency at which S holds where none is stated: before it is settled, the first one that moved if
+        nothing else did or if it is in the band, else the middle of the band; 0 before any motion."""
+        if self.settled_hz or self.motion_hz is None:
+            return self.settled_hz or self.first_hz
+        low_hz, high_hz = self.motion_hz
+        first = self.late_s is not None and low_hz <= self.first_hz <= self.to_hz
+        return self.first_hz if first else float(np.sqrt(low_hz * high_hz))
+
+    def stating(self, band_hz: tuple[float, float] | None) -> Self:
+        """The same where the band is stated; None: it is settled by windows."""
+        if band_hz is None:
+            return replace(self, fixed=False)
+        return replace(self, motion_hz=band_hz, fixed=True)
+
+    def keeping(self, records: Sequence[Record]) -> tuple[Self, list[Record]]:
+        """After another band: the records of the motion in it, and the same beside these."""
+        found = [(record, record.within(self.to_hz)) for record in records]
+        kept = [one for _, one in found if one is not None]
+        left_out = sum(record.windows for record, one in found if one is None)
+        over = replace(self, deviations=Deviations(), left_open=LeftOpen(), left_out=self.left_out + left_out)
+        for record in kept:
+            over = over.taken(record)
+        return over, kept
 
     def taken(self, record: Record) -> Self:
         """After a window."""
         deviations, left_open = self.deviations.plus(record.deviations), self.left_open.plus(record.left_open)
         return replace(self, deviations=deviations, left_open=left_open)
+
+    def told_since(self, before: OverFrequency, priors: Priors) -> str:
+        """For the operator: the band that was settled since; "" if nothing was."""
+        several = self.windows >= SEVERAL > before.windows and not self.fixed
+        another = self.motion_hz != before.motion_hz and before.motion_hz is not None
+        if self.motion_hz is None or not (several or another or self.left_out > before.left_out):
+            return ""
+        low_hz, high_hz = self.motion_hz
+        found = (
+            "the channel states this band"
+            if self.fixed
+            else (f"{self.windows} windows have this band in common" + ("" if several else ", and may still change it"))
+        )
+        left_out = self.left_out - before.left_out
+        lost = f"; {left_out} older windows with motion above it are left out" if left_out else ""
+        remedy = "" if self.fixed else ". Set band_hz of the channel if another band is to be used"
+        return (
+            f"S holds at {self.reference_hz(priors):.3g} Hz and is estimated from motion of {low_hz:.3g} to "
+            f"{high_hz:.3g} Hz: {found}{lost}{remedy}"
+        )
 
     def reference_hz(self, priors: Priors) -> float:
         """The frequency at which S holds; 0 if nothing moved yet."""
@@ -195,7 +264,31 @@ class OverFrequency:
         band = state["motion_hz"]
         motion_hz = None if band is None else (band[0], band[1])
         sums = {"deviations": Deviations(**state["deviations"]), "left_open": LeftOpen.load(state["left_open"])}
-        return cls(**{**state, "motion_hz": motion_hz, **sums})
+        found = cls(**{**state, "motion_hz": motion_hz, **sums})
+        if "settled_hz" in state or not found.first_hz:
+            return found
+        # The first window settled it when this state was made, for as long as it lives.
+        return replace(found, settled_hz=found.at_hz if found.late_s is None else found.first_hz)
+
+
+def common_band(records: Sequence[Record]) -> tuple[float, float, int]:
+    """The ends in Hz that the bands of all but a quarter of the windows reach, of four windows all, and how many
+    windows they are. Windows without a band do not count. Where less than an octave is left, it begins at the lowest
+    frequency of all."""
+    bands = [(record.motion_hz, record.windows) for record in records if record.motion_hz is not None]
+    low_hz, high_hz = np.array([band for band, _ in bands]).T
+    windows = np.array([count for _, count in bands])
+    total = int(windows.sum())
+    but = (total - 1) // 4
+    ends_hz = _at_rank(high_hz, windows, but)
+    begins_hz = _at_rank(low_hz, windows, total - 1 - but)
+    return (begins_hz if 2.0 * begins_hz < ends_hz else float(low_hz.min())), ends_hz, total
+
+
+def _at_rank(values: Array, counts: Array, rank: int) -> float:
+    """The value with this rank, from 0 on, where each value (n,) counts `counts` (n,) times."""
+    order = np.argsort(values, kind="stable")
+    return float(values[order[np.searchsorted(np.cumsum(counts[order]), rank, side="right")]])
 
 
 def _at_reference(stated: Priors) -> Array:

@@ -16,9 +16,9 @@ import numpy as np
 from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.never_turned import mean_input
-from calib.excitation.bands import motion_band_hz
+from calib.excitation.bands import ABOVE, HIGHEST, motion_band_hz, parts, share_above
 from calib.excitation.excited import Motion, excited, excited_together, excited_ways, motion_of
-from calib.model import Array, Pose, Window
+from calib.model import Array, BandSums, Pose, Window, WindowSums
 from calib.signal.response import ALL_POWERS
 
 TERMS = len(ALL_POWERS)  # of the response over frequency, at most
@@ -48,9 +48,14 @@ class Record:
     (3,): mean input acceleration by the pose as stated, NaN where nobody stated gravity. `count`: samples.
 
     Response: `told` (r, TERMS + 1): rows of its terms alone; `deviations` and `left_open`: what the bands say beside.
-    `motion_hz`: the band of the motion, None where it tells no response; `mean_hz` its mean frequency, 0 at rest.
+    `motion_hz`: the band of the motion that lasts, also where less of it was used; None where it tells no response.
+    `mean_hz`: the mean frequency of what was used, 0 at rest.
     `misfit` (2,): chi-squared by which the slopes of merged windows differ, and its degrees of freedom. `motion`: that
     of a window whose directions the noise of the reference turns (see `together`), None of any other.
+
+    `to_hz`: no motion above it is in the sums. `bands`: the sums of the newest windows by band, from which `within`
+    makes the record of a narrower band, with the noise `reference_noise` (2, M) of the reference, as rms in their
+    points.
     """
 
     pose: Pose
@@ -85,6 +90,9 @@ class Record:
     mean_hz: float
     misfit: tuple[float, float] = (0.0, 0.0)
     motion: Motion | None = None
+    to_hz: float = np.inf
+    bands: BandSums | None = None
+    reference_noise: Array | None = None
 
     @classmethod
     def of(
@@ -96,14 +104,17 @@ class Record:
         reference: str = "",
         to_hz: float = np.inf,
     ) -> Record:
-        """The record of a window that is used. Its bands up to `to_hz` tell the response over frequency; where no
-        window before settled that, those of its own motion."""
+        """The record of a window that is used, of its motion up to `to_hz`; where no window before settled that, up to
+        the end of its own motion that lasts."""
         found = excited(window)
         if found.turned:
             found = excited_together([window])[0][0]
         motion_hz = motion_band_hz([window])
-        if motion_hz is not None and to_hz == np.inf:
-            to_hz = WIDER * motion_hz[1]
+        lasts_hz = (
+            None if motion_hz is None else window.motion_hz or motion_band_hz([window], lasting=True) or motion_hz
+        )
+        if lasts_hz is not None and to_hz == np.inf:
+            to_hz = WIDER * lasts_hz[1]
         data = condense([found], response_hz=to_hz, one_frequency=motion_hz is None)
         channels = data.channels
         passed, told = np.zeros((TERMS, 2 * channels, channels)), np.zeros((0, TERMS + 1))
@@ -118,7 +129,12 @@ class Record:
             deviations, left_open = bands.deviations, bands.left_open
         t = temperature_degc if np.isfinite(temperature_degc) else 0.0
         directions = found.directions
-        return cls(
+        mean_hz = mean_frequency_hz(data)
+        ends_hz = WIDER * (mean_hz if motion_hz is None else motion_hz[1])
+        noise, kept = window.reference_noise, _up_to(window.bands, ends_hz)
+        if window.bands is not None and kept is not None and noise is not None:
+            noise = noise * np.sqrt(window.bands.points.sum() / kept.points.sum())
+        made = cls(
             window.pose, reference, day, (day, day), 1, lag_s, window.response, window.u_lag_s, found.attenuation,
             window.independent, np.round(directions @ directions.T, 6) + 0.0,
             np.eye(channels) if found.pose.along is None else found.pose.along,
@@ -126,8 +142,43 @@ class Record:
             data.root[0], data.slopes[0], passed, float(data.omega2[0]), data.type_a.noise[0], data.type_a.scores,
             data.mean_x[0], data.mean_v[0][None], np.array([[1.0, t, t * t]]), temperature_degc,
             mean_input(window), float(data.count[0]), told, deviations, left_open,
-            motion_hz, mean_frequency_hz(data), motion=motion_of(window) if found.turned else None,
+            lasts_hz, mean_hz,
+            to_hz=ends_hz, bands=kept, reference_noise=noise, motion=motion_of(window) if found.turned else None,
         )  # fmt: skip
+        return made.within(to_hz) or made
+
+    def within(self, to_hz: float) -> Record | None:
+        """The record of the same motion up to `to_hz`, exactly that of the sums by band; None where there is motion
+        above, and these sums are not kept."""
+        if self.to_hz <= HIGHEST * to_hz:
+            return self
+        if self.bands is None:
+            return None
+        if share_above(self.bands, HIGHEST * to_hz) <= ABOVE:
+            return replace(self, to_hz=to_hz)
+        if (bands := _up_to(self.bands, to_hz)) is None:
+            return None
+        count = float(bands.points.sum())
+        mean = np.append(self.mean_x, self.means[0])
+        sums = WindowSums(self.channels, np.array([count]), mean[None], bands.products.sum(axis=0)[None])
+        window = Window(
+            0.0, 0.0, self.pose, sums, True, "", round(count), 0, u_lag_s=self.u_lag_s, independent=bands.independent,
+            reference_noise=self._noise_within(bands), bands=bands, response=self.response, motion_hz=self.motion_hz,
+        )  # fmt: skip
+        made = Record.of(window, self.day, self.lag_s, self.temperature_degc, self.reference, to_hz)
+        return replace(made, mean_x=self.mean_x, to_hz=to_hz)
+
+    def _noise_within(self, bands: BandSums) -> Array | None:
+        """(2, M) rms of the reference's noise in points of these bands, the first ones of all: its density is even."""
+        assert self.bands is not None
+        if self.reference_noise is None:
+            return None
+        u, du = self.reference_noise
+        share = np.ones_like(u)  # of the noise's bandwidth
+        ends_hz = np.sqrt(3.0) * du[u > 0.0] / u[u > 0.0] / (2.0 * np.pi)
+        share[u > 0.0] = np.minimum(HIGHEST * bands.high_hz[-1] / ends_hz, 1.0)
+        fewer = float(self.bands.points.sum() / bands.points.sum())
+        return np.sqrt(fewer * np.array([share, share**3])) * self.reference_noise
 
     @property
     def channels(self) -> int:
@@ -172,30 +223,35 @@ class Record:
     def with_reference_times(self, factor: float) -> Record:
         """The same with all indications of the reference multiplied by `factor`, by another certificate of it."""
         moved = self.held_mps2 - self.pose.gravity_mps2
+        bands, by = self.bands, np.append(np.full(2 * self.channels, factor), np.ones(3))
+        if bands is not None:
+            bands = replace(bands, products=bands.products * np.outer(by, by), noise=bands.noise * by**2)
         return replace(
             self, root=self.root * factor, passed=self.passed * factor, mean_x=self.mean_x * factor,
-            held_mps2=self.pose.gravity_mps2 + moved * factor,
+            held_mps2=self.pose.gravity_mps2 + moved * factor, bands=bands,
+            reference_noise=None if self.reference_noise is None else self.reference_noise * factor,
         )  # fmt: skip
 
     def snapshot(self) -> dict[str, Any]:
         """Plain values and arrays, for `load`."""
-        held = {f.name: getattr(self, f.name) for f in fields(self)}
-        pose = {f.name: getattr(self.pose, f.name) for f in fields(self.pose)}
+        held = _plain(self) | {"pose": _plain(self.pose), "bands": None if self.bands is None else _plain(self.bands)}
         motion = None if self.motion is None else asdict(self.motion)
         told = {"deviations": asdict(self.deviations), "left_open": asdict(self.left_open)}
-        return held | {"pose": pose, "motion": motion} | told
+        return held | {"motion": motion} | told
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> Record:
-        """The record whose snapshot this is."""
+        """The record whose snapshot this is. Where it does not tell how far the motion reaches, its band does."""
         pairs = {name: tuple(state[name]) for name in ("days", "response", "misfit")}
-        band, motion = state["motion_hz"], state.get("motion")
+        band, bands, motion = state["motion_hz"], state.get("bands"), state.get("motion")
+        to_hz = WIDER * (state["mean_hz"] if band is None else band[1])
         own = {
             "pose": Pose(**state["pose"]), "deviations": Deviations(**state["deviations"]),
             "left_open": LeftOpen.load(state["left_open"]), "motion_hz": None if band is None else (band[0], band[1]),
             "motion": None if motion is None else Motion(**motion),
+            "bands": None if bands is None else BandSums(**bands),
         }  # fmt: skip
-        return cls(**{**state, **pairs, **own})
+        return cls(**{"to_hz": to_hz, **state, **pairs, **own})
 
 
 def together(records: Sequence[Record], *, fixed: bool) -> list[Record]:
@@ -212,3 +268,15 @@ def together(records: Sequence[Record], *, fixed: bool) -> list[Record]:
         return list(records)
     excited_by_all = np.round(ways @ ways.T, 6) + 0.0
     return [r if r.motion is None else replace(r, excited=excited_by_all) for r in records]
+
+
+def _up_to(bands: BandSums | None, to_hz: float) -> BandSums | None:
+    """The bands up to a frequency; None where there is none."""
+    if bands is None or not (kept := bands.high_hz <= HIGHEST * to_hz).any():
+        return None
+    return parts(bands, kept)
+
+
+def _plain(found: Record | Pose | BandSums) -> dict[str, Any]:
+    """The fields by name."""
+    return {f.name: getattr(found, f.name) for f in fields(found)}

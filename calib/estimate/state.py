@@ -20,7 +20,7 @@ from calib.estimate.estimate import Estimate, Now, Then, estimate
 from calib.estimate.innovation import Innovation
 from calib.estimate.never_turned import never_turned
 from calib.estimate.nuisances import Priors
-from calib.estimate.over_frequency import OverFrequency, changed
+from calib.estimate.over_frequency import SEVERAL, OverFrequency, changed
 from calib.estimate.past import Change, Past, epoch_days
 from calib.estimate.quantities import ALL_RATES, KINDS, LAG, PRIORS, S_AND_Q, Quantity
 from calib.estimate.record import Record, together
@@ -66,7 +66,8 @@ class State:
 
     `mean`, `standard_uncertainty` (12,): what was known of S, Q beforehand, in output units; `fixed` mounts do not
     turn. Days count from any origin. `check`: the priors beside further references, which are mounted all the time as
-    the first one is. The first has place 0, the next one has place 1.
+    the first one is. The first has place 0, the next one has place 1. `band_hz`: the ends in Hz of the motion that is
+    used; None: windows settle it.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class State:
         *,
         fixed: bool,
         check: Sequence[Priors] = (),
+        band_hz: tuple[float, float] | None = None,
     ) -> None:
         self._mean, self._u = np.array(mean, dtype=float), np.array(standard_uncertainty, dtype=float)
         self._priors, self._wander, self._temperature = [priors, *check], wander, temperature
@@ -90,7 +92,8 @@ class State:
         self._records: list[Record] = []
         self._steps: list[Step] = []
         self._dated: list[Dated] = []
-        self._over = OverFrequency()
+        self._band_hz = band_hz
+        self._over = OverFrequency().stating(band_hz)
         self._held_mps2: Array | None = None  # mean input acceleration of a mount that never turned so far
         self._now = estimate([], self.statements).now
         self._read: tuple[Now, str, Array, Array] | None = None  # what `_values` found
@@ -136,20 +139,20 @@ class State:
 
     def with_window(self, record: Record, *, at_its_lag: bool = False) -> tuple[Innovation, Self]:
         """What the window says against the state at its time (see `innovation`), and a copy that has taken it."""
-        told, trial, ahead, rows = self._against(record, at_its_lag)
-        trial._take(record, ahead, rows)
+        told, trial, used, ahead, rows = self._against(record, at_its_lag)
+        trial._take(used, ahead, rows)
         return told, trial
 
-    def _against(self, record: Record, at_its_lag: bool) -> tuple[Innovation, Self, Now, Array]:
+    def _against(self, record: Record, at_its_lag: bool) -> tuple[Innovation, Self, Record, Now, Array]:
         trial = self.copy()
-        ahead = trial._know(record)
+        record, ahead = trial._know(record)
         at = None
         if at_its_lag:
             at = ahead.mean.copy()
             if (k := ahead.unknowns.at.get(_lag_of(record.reference))) is not None:
                 at[k] = record.lag_s
         rows = ahead.rows(trial._directed(record), at)
-        return ahead.says(rows), trial, ahead, rows
+        return ahead.says(rows), trial, record, ahead, rows
 
     @property
     def _mean_is_held(self) -> bool:
@@ -219,6 +222,10 @@ class State:
         moved = np.sum([r.excited for r in together(self._records, fixed=self._mean_is_held)], axis=0)
         size, ways = np.linalg.eigh(moved) if self._records else (np.zeros(3), np.eye(3))
         return np.asarray(ways.T[size <= STILL * size[-1]])
+
+    def settled_since(self, earlier: State) -> str:
+        """For the operator: which band and frequency several windows settled since an earlier state; or ""."""
+        return self._over.told_since(earlier._over, self._priors[0])
 
     def _determined(self, mean: Array, covariance: Array) -> Flags:
         return determined(mean, np.sqrt(covariance.diagonal()), self._u, np.ones(12, dtype=bool))
@@ -445,7 +452,7 @@ class State:
     def update(self, record: Record) -> None:
         """Take a window."""
         self.close_day(record.day)
-        ahead = self._know(record)
+        record, ahead = self._know(record)
         self._take(record, ahead, ahead.rows(self._directed(record)))
 
     def close_day(self, day: float) -> Estimate | None:
@@ -467,23 +474,39 @@ class State:
 
     def beyond(self, base: State) -> tuple[list[Record], list[Step]]:
         """The windows and the steps that an earlier state does not have, of which this one is a copy that went on."""
-        kept = {id(record) for record in base._records}
-        return [r for r in self._records if id(r) not in kept], [s for s in self._steps if s not in base._steps]
+        kept = {id(record.mean_x) for record in base._records}  # a record of a narrower band has the same means
+        return [r for r in self._records if id(r.mean_x) not in kept], [s for s in self._steps if s not in base._steps]
 
     def take_also(self, records: Sequence[Record], steps: Sequence[Step]) -> None:
         """Take windows that were held, and the steps that they showed."""
         self._steps = sorted([*self._steps, *steps], key=lambda step: step.day)
-        self._records = sorted([*self._records, *records], key=lambda record: record.day)
         for record in records:
-            self._over = self._over.begun(record)
-            self._count(record)
+            self._begin(record)
+            self._count(record.within(self._over.to_hz) or record)
+        self._records.sort(key=lambda record: record.day)
         self.solve()
 
-    def _know(self, record: Record) -> Now:
-        """The state at the time of a window, with the unknowns that no window had before."""
-        over, anew = self._over.begun(record), False
-        if over is not self._over:
-            self._over, anew = over, True
+    def _begin(self, record: Record) -> bool:
+        """A window comes: band and frequency may be settled by it. Returns whether one of them is another one now."""
+        was, at_hz = self._over, self._over.at_hz
+        self._over = was.begun(record, self._records)
+        another = self._use_band(was)
+        return another or self._over.at_hz != at_hz or self._over.late_s != was.late_s
+
+    def _use_band(self, was: OverFrequency) -> bool:
+        """Of the records, only the motion within the band stays. Returns whether it is another one than it `was`."""
+        if self._over.motion_hz == was.motion_hz:
+            return False
+        self._over, self._records = self._over.keeping(self._records)
+        if was.motion_hz is not None:  # the unit of the response is another one: its old values are no beginning
+            self._now = estimate([], self.statements, also=[self._now.day]).now
+        return True
+
+    def _know(self, record: Record) -> tuple[Record, Now]:
+        """A window as far as its motion is used, and the state at its time, with the unknowns that no window had
+        before."""
+        anew = self._begin(record)
+        record = record.within(self._over.to_hz) or record
         if self._fixed and np.isfinite(record.held_mps2).all():
             if self._held_mps2 is None:
                 self._held_mps2, anew = record.held_mps2, True
@@ -497,16 +520,18 @@ class State:
                 self._now = estimate([], self.statements, also=[day]).now
         elif not self._records and self._now.day < record.day:
             self._now = estimate([], self.statements, also=[record.day]).now
-        return self._now.passed_to(record.day).meeting(record)
+        return record, self._now.passed_to(record.day).meeting(record)
 
     def _take(self, record: Record, ahead: Now, rows: Array) -> None:
-        self._records.append(record)
-        self._now = ahead.with_window(record, rows)
         self._count(record)
+        self._now = ahead.with_window(record, rows)
         if self._moved():
             self.solve()
 
     def _count(self, record: Record) -> None:
+        old, new = self._records[: 1 - SEVERAL], self._records[1 - SEVERAL :]
+        old = [one if one.bands is None else replace(one, bands=None) for one in old]
+        self._records = [*old, *new, record]
         self._over = self._over.taken(record)
         self._used = [r for r in self._used if r != record.reference] + [record.reference]
         day = int(np.floor(record.day))
@@ -623,12 +648,14 @@ class State:
 
         `gravity_mps2`: the local gravity as stated before and now, if that changed.
         """
-        before = self.result()
+        before, was = self.result(), self._over
+        self._over = was.stating(self._band_hz)
+        another = self._use_band(was)
         if gravity_mps2 is not None:
             ratio = gravity_mps2[1] / gravity_mps2[0]
             self._records = [record.with_gravity(ratio) for record in self._records]
             self._held_mps2 = None if self._held_mps2 is None else self._held_mps2 * ratio
-        elif self._stated_then is None:
+        elif self._stated_then is None and not another:
             return False
         self._stated_then = None
         self.solve()

@@ -84,6 +84,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
             sum(r.misfit[1] for r in records) + 3.0 * rank * (len(records) - 1),
         ),
         motion=reduce(Motion.plus, motions) if motions else None,
+        to_hz=max(r.to_hz for r in records), bands=None, reference_noise=None,
     )  # fmt: skip
 
 

@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array, BandSums, Window
-from calib.signal.order_statistics import distinct
+from calib.signal.band import hanning
+from calib.signal.order_statistics import distinct, median
+from calib.signal.response import Complex
 
 BANDS_AN_OCTAVE = 6
 HANN = 0.5
@@ -30,6 +32,7 @@ OVER_NOISE = 100.0
 LEAST_SHARE, FEWEST_THIRDS = 1e-2, 4
 LEAST_SHOWN = 0.25  # of V in a band, by the motion: with less, the reference's noise may look like motion
 HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is rounded
+LASTS = 0.25  # of its mean power that a band has for half of the time: with less, its motion comes and goes
 BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
 
 
@@ -52,10 +55,26 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
     lines = np.fft.rfft(rows, axis=1)[:, 1:]
     frequency_hz: Array = np.fft.rfftfreq(n, 1.0 / rate_hz)[1:].astype(np.float64)
     edges = _edges(frequency_hz, fewest)
-    products = np.array([(lines[:, a:b] @ lines[:, a:b].conj().T).real for a, b in itertools.pairwise(edges.tolist())])
+    own = [lines[:, a:b] for a, b in itertools.pairwise(edges.tolist())]
+    products = np.array([(part @ part.conj().T).real for part in own])
     ends_hz = np.append(frequency_hz, 0.5 * rate_hz)[edges]
-    nothing = np.zeros((len(products), 2 * m + 3))
-    return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing)
+    nothing, lasting = np.zeros((len(products), 2 * m + 3)), np.array([_lasting(part[:m]) for part in own])
+    return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing, lasting)
+
+
+def _lasting(lines: Complex) -> float:
+    """The median over time of the power of a band, over its mean. `lines` (m, L) are those of the motion in the band;
+    their envelope has one point for each line. The power of noise has a median of 0.7 to 0.9 times its mean, a sine has
+    1, and bumps that take a small part of the time have almost nothing (scipy/scipy pull request 8970 averages spectra
+    so)."""
+    power = np.sum(np.abs(np.fft.ifft(lines * hanning(lines.shape[1] + 2)[1:-1], axis=1)) ** 2, axis=0)
+    return float(median(power) / max(power.mean(), np.finfo(float).tiny))
+
+
+def parts(bands: BandSums, kept: NDArray[np.bool_] | slice) -> BandSums:
+    """Some of the bands."""
+    names = ("low_hz", "high_hz", "points", "products", "noise", "lasting")
+    return replace(bands, **{name: getattr(bands, name)[kept] for name in names})
 
 
 def beside_noise(bands: BandSums, sensor_noise: Array) -> BandSums:
@@ -86,8 +105,7 @@ def without_noise(bands: BandSums, noise: Array) -> BandSums:
         kept &= bands.high_hz <= end_hz
     products = bands.products.copy()
     products[:, range(2 * m), range(2 * m)] -= power[:, : 2 * m]
-    low_hz, high_hz, points = (part[kept] for part in (bands.low_hz, bands.high_hz, bands.points))
-    return BandSums(m, low_hz, high_hz, points, bands.independent, products[kept], power[kept])
+    return parts(replace(bands, products=products, noise=power), kept)
 
 
 @lru_cache(maxsize=4)
@@ -114,12 +132,11 @@ def _edges(frequency_hz: Array, fewest: int) -> NDArray[np.int64]:
     return np.array([*starts, len(frequency_hz)])
 
 
-def share_above(window: Window, to_hz: float) -> float:
-    """The share of a window's motion, in power, that is above a frequency; 0 where the window has no bands.
+def share_above(bands: BandSums | None, to_hz: float) -> float:
+    """The share of a window's motion, in power, that is above a frequency; 0 where the window has no `bands`.
 
     The power of a band is taken to be even over it: a band that hardly reaches above the frequency hardly counts.
     """
-    bands = window.bands
     if bands is None:
         return 0.0
     m = bands.reference_channels
@@ -128,14 +145,15 @@ def share_above(window: Window, to_hz: float) -> float:
     return float(power @ part / max(power.sum(), np.finfo(float).tiny))
 
 
-def motion_band_hz(windows: Sequence[Window]) -> tuple[float, float] | None:
+def motion_band_hz(windows: Sequence[Window], *, lasting: bool = False) -> tuple[float, float] | None:
     """The band in Hz of the motion of all windows. None where no window has bands, or where the motion is in a few
-    narrow bands only (sines), which cannot tell a response over frequency."""
+    narrow bands only (sines), which cannot tell a response over frequency. `lasting`: of a band in which the motion
+    comes and goes, only the power counts that is there for half of the time."""
     bands = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
     if not bands:
         return None
     low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
-    each = [_powers(b) for b in bands]
+    each = [_powers(b, lasting=lasting) for b in bands]
     power, square = (np.concatenate(part) for part in zip(*each, strict=True))
     if not power.sum() > 0.0:
         return None
@@ -176,10 +194,14 @@ def _end(edge: Array, order: Array, power: Array, outside: float) -> float:
     return float(edge[sequence][min(int(np.searchsorted(share, outside)), len(edge) - 1)])
 
 
-def _powers(bands: BandSums) -> tuple[Array, Array]:
-    """The power of the motion and of its derivative, in each band of a window; 0 in bands that are incoherent."""
+def _powers(bands: BandSums, *, lasting: bool = False) -> tuple[Array, Array]:
+    """The power of the motion and of its derivative, in each band of a window; 0 in bands that are incoherent.
+    `lasting` as in motion_band_hz."""
     m, powers = bands.reference_channels, np.diagonal(bands.products, axis1=1, axis2=2)
     power, square = powers[:, :m].sum(axis=1), powers[:, m : 2 * m].sum(axis=1)
+    if lasting:
+        share = np.where(bands.lasting < LASTS, bands.lasting, 1.0)
+        power, square = share * power, share * square
     seen = _coherent(bands)
     return np.where(seen, power, 0.0), np.where(seen, square, 0.0)
 

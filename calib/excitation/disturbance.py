@@ -7,11 +7,12 @@ without phase shift that attenuates each band by as much as its noise is stronge
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.excitation.bands import parts
 from calib.excitation.detection import RELATED, incoherent_by_band
 from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.windows import Points
@@ -68,8 +69,7 @@ class NoiseFilter:
         points = bands.points * own**2 / np.maximum((stop - first) * square, TINY)
         kept = points >= 2 * bands.reference_channels + MORE_POINTS
         noise = bands.noise * (own / (stop - first))[:, None]
-        low_hz, high_hz, products, noise = (part[kept] for part in (bands.low_hz, bands.high_hz, bands.products, noise))
-        return BandSums(bands.reference_channels, low_hz, high_hz, points[kept], bands.independent, products, noise)
+        return parts(replace(bands, points=points, noise=noise), kept)
 
 
 def against_noise(points: Points, reference_noise: Array, *, knocked: bool) -> NoiseFilter | None:

@@ -37,7 +37,8 @@ ELSEWHERE = {
     "site-runs": "benchmarks.site", "site-large": "benchmarks.site",
     "faults": "tests.faults.outcome", "soak-day": "benchmarks.soak", "soak-hour": "benchmarks.soak",
     **{name: f"benchmarks.online.{name}" for name in
-       ("agreement", "bench", "chip", "cost", "coverage", "day", "filters", "harm", "references", "touched", "year")},
+       ("agreement", "bench", "chip", "cost", "coverage", "day", "filters", "harm", "lorries",
+        "references", "touched", "year")},
 }  # fmt: skip
 
 

@@ -94,6 +94,6 @@ def test_a_filter_tells_how_many_points_and_how_much_noise_stay_in_a_band() -> N
         np.array([11.0, 26.0, 24.0]),
         np.array([160.0, 1280.0, 300.0]),
     )
-    left = passes.left_in(BandSums(3, low_hz, high_hz, points, 1.0, products, noises))
+    left = passes.left_in(BandSums(3, low_hz, high_hz, points, 1.0, products, noises, np.ones(3)))
     np.testing.assert_allclose(left.points, [160.0, 320.0], rtol=0.02)
     np.testing.assert_allclose(left.noise[:, -3:], [[1.0] * 3, [0.25] * 3], rtol=0.02)
