@@ -264,11 +264,7 @@ class OverFrequency:
         band = state["motion_hz"]
         motion_hz = None if band is None else (band[0], band[1])
         sums = {"deviations": Deviations(**state["deviations"]), "left_open": LeftOpen.load(state["left_open"])}
-        found = cls(**{**state, "motion_hz": motion_hz, **sums})
-        if "settled_hz" in state or not found.first_hz:
-            return found
-        # The first window settled it when this state was made, for as long as it lives.
-        return replace(found, settled_hz=found.at_hz if found.late_s is None else found.first_hz)
+        return cls(**{**state, "motion_hz": motion_hz, **sums})
 
 
 def common_band(records: Sequence[Record]) -> tuple[float, float, int]:

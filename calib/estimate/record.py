@@ -166,7 +166,7 @@ class Record:
             reference_noise=self._noise_within(bands), bands=bands, response=self.response, motion_hz=self.motion_hz,
         )  # fmt: skip
         made = Record.of(window, self.day, self.lag_s, self.temperature_degc, self.reference, to_hz)
-        return replace(made, mean_x=self.mean_x, to_hz=to_hz)
+        return replace(made, mean_x=self.mean_x, to_hz=to_hz, scores=self.scores)
 
     def _noise_within(self, bands: BandSums) -> Array | None:
         """(2, M) rms of the reference's noise in points of these bands, the first ones of all: its density is even."""
@@ -241,17 +241,16 @@ class Record:
 
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> Record:
-        """The record whose snapshot this is. Where it does not tell how far the motion reaches, its band does."""
+        """The record whose snapshot this is."""
         pairs = {name: tuple(state[name]) for name in ("days", "response", "misfit")}
-        band, bands, motion = state["motion_hz"], state.get("bands"), state.get("motion")
-        to_hz = WIDER * (state["mean_hz"] if band is None else band[1])
+        band, bands, motion = state["motion_hz"], state["bands"], state["motion"]
         own = {
             "pose": Pose(**state["pose"]), "deviations": Deviations(**state["deviations"]),
             "left_open": LeftOpen.load(state["left_open"]), "motion_hz": None if band is None else (band[0], band[1]),
             "motion": None if motion is None else Motion(**motion),
             "bands": None if bands is None else BandSums(**bands),
         }  # fmt: skip
-        return cls(**{"to_hz": to_hz, **state, **pairs, **own})
+        return cls(**{**state, **pairs, **own})
 
 
 def together(records: Sequence[Record], *, fixed: bool) -> list[Record]:
