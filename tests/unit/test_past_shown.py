@@ -31,9 +31,9 @@ RECORDING = "fieldcal-000001.mcap"
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bench for 80 s: four windows."""
+    """The bench for 55 s: four windows."""
     directory = tmp_path_factory.mktemp("past")
-    record(directory, 80.0)
+    record(directory, 55.0)
     return directory
 
 
