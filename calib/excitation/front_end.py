@@ -7,7 +7,7 @@ band of the motion; the windows found in them get their verdicts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -17,9 +17,10 @@ from calib.excitation import detection
 from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
 from calib.excitation.bands import TAPER, beside_noise
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
+from calib.excitation.sustained import sustained_hz
 from calib.excitation.turning import feels_gravity, standing_parts
-from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
-from calib.excitation.windows import Points, at_rest, motion_windows, rest_window, still_window
+from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, disproportionate
+from calib.excitation.windows import CALM, Points, at_rest, motion_windows, rest_window, still_window
 from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
 from calib.signal.band import band_above_noise, lowpass, without_short_holes
 from calib.signal.corner import integral, with_integral, without_corner
@@ -44,6 +45,7 @@ MOST_MARGIN_S = 5.0  # a second derivative at 10 Hz takes 4.2 s
 MOST_MISSING_PCT = 5.0
 # A sensor that follows the motion better, with fewer knocks, needs no other weights of the frequencies.
 COHERENT, KNOCKED_PCT = 0.999, 1.0
+CALM_SHARE = 0.25  # of the time that moves as well, but weakly: a window is cut into pieces where shocks end
 # Of the motion in a window: with fewer, its spectrum is that of the window's ends, and it shows no direction but one.
 FEWEST_CYCLES = 2.0
 LEAST_CYCLES, LEAST_LONG_CYCLES, LONG_S = 1.0, 0.5, 10.0  # a few ms of lag bend a long turn less than a short one
@@ -255,9 +257,13 @@ def _motion(
     align = partial(aligned, sensor, reference, instrument, span_s, lag_s, settings, response)
     if (found := align()) is None:
         return []
-    if instrument.has_corner:
-        pose = with_integral(pose)
+    stands, pose = pose, with_integral(pose) if instrument.has_corner else pose
     made = _beside(pose, found, settings)
+    if settings.limit_band and settings.to_hz is None and (lasting_hz := _beside_shocks(found.points, made)):
+        limited = replace(settings, to_hz=lasting_hz)
+        within = _motion(stands, sensor, reference, instrument, span_s, lag_s, limited, response)
+        if any(window.used for window in within):
+            return within
     knocked = any(100.0 * w.left_out > KNOCKED_PCT * (w.points + w.left_out) for w in made)
     against = None
     if settings.limit_band and (knocked or any(w.numbers.get("coherence", 1.0) < COHERENT for w in made)):
@@ -273,6 +279,20 @@ def _motion(
     # Where the noise of the reference is stated, all other noise is the sensor's.
     sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
     return [w if w.bands is None else replace(w, bands=_noisy(w.bands, sensor_noise, against)) for w in made]
+
+
+def _beside_shocks(points: Points, made: Sequence[Window]) -> float | None:
+    """The upper end in Hz of the motion that lasts, where shocks beside it keep it from being used; else None.
+
+    In such windows the output seems not to be proportional, or much of their time is calm compared with the shocks.
+    """
+    calm_s = sum(w.stop_s - w.start_s for w in made if w.reason == CALM)
+    if not any(disproportionate(w.numbers) for w in made) and calm_s <= CALM_SHARE * (
+        made[-1].stop_s - made[0].start_s
+    ):
+        return None
+    rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
+    return sustained_hz(points.u[:, : own_channels(points.u.shape[1])], rate_hz)
 
 
 def _noisy(bands: BandSums, sensor_noise: Array, against: NoiseFilter | None) -> BandSums:
