@@ -17,6 +17,7 @@ from calib.excitation import detection
 from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
 from calib.excitation.bands import TAPER, beside_noise
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
+from calib.excitation.hum import hum_hz, without_lines
 from calib.excitation.sustained import sustained_hz
 from calib.excitation.turning import feels_gravity, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, disproportionate
@@ -179,6 +180,10 @@ def aligned(
     rows[:3], rows[3 : 3 + k], rows[3 + k :] = V.T, at.u.T, at.du.T
     rows[:, ~at.usable] = np.nan
     columns = rows.T
+    shown = np.isfinite(columns).all(axis=1) & inside
+    hums_hz = hum_hz(columns[shown, 3 : 3 + m], columns[shown, :3], sensor_rate_hz) if settings.limit_band else []
+    if hums_hz:
+        columns = without_lines(columns, sensor_rate_hz, hums_hz)
     band_hz, noise = band_to_keep(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
     clipped, independent, unfiltered = 0, 1.0, columns
     if band_hz is not None and settings.limit_band:
@@ -200,6 +205,7 @@ def aligned(
         "filled_samples": (filled & usable).sum(),
         "reference_filled_samples": (raw_filled & raw_inside).sum(),
         "reference_glitches": (odd & raw_inside).sum(),
+        "hum_lines": len(hums_hz),
     }
     kept = as_slice(np.flatnonzero(usable))
     points = Points(time_s[kept], *np.split(columns.T[:, kept].T, [3, 3 + k], axis=1))
