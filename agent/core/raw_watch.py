@@ -18,6 +18,9 @@ from hw.block import SampleBlock
 AGAIN_S = 600.0  # between two messages on one output
 WORTH_S = 60.0  # that an output was held, for a message when it changes again
 FEW, WITHIN_S = 3, 600.0  # sticks or repeated bursts within this time that are told: fewer may be chance
+# Wrong bits that are told, and their share of all samples that stand alone: of ten knocks, eight are as near to powers
+# of two once in five million times.
+FEW_FLIPS, FLIPS = 10, 0.8
 LEAST_END = 128.0  # of a converter: of one with 8 bits
 
 
@@ -61,6 +64,7 @@ class RawWatch:
             return []
         outputs = self._outputs.get(block.device)
         if outputs is None or outputs.axes != x.shape[1]:
+            self.forget(block.device)
             outputs = self._outputs[block.device] = Outputs(x.shape[1])
         anew, repeats = bool(int(block.flags) & UNCOUNTED), outputs.repeats
         outputs.update(block.first_index, x, block.nominal_rate_hz, block.burst_count, anew=anew)
@@ -100,19 +104,24 @@ class RawWatch:
         return [said]
 
     def _now_and_then(self, device: str, outputs: Outputs, now_s: float) -> Iterator[str]:
-        """Messages on what happened several times within WITHIN_S: short sticks of an output, repeated bursts."""
-        counts = [*outputs.sticks.tolist(), outputs.repeats]
+        """Messages on what happened several times within WITHIN_S."""
+        counts = [*outputs.sticks.tolist(), outputs.repeats, outputs.flipped, outputs.alone]
         seen = [(at, own) for at, own in self._seen.get(device, []) if now_s - at <= WITHIN_S] or [(now_s, counts)]
         if seen[-1][1] != counts:
             seen.append((now_s, counts))
         self._seen[device] = seen
-        for k, (new, old) in enumerate(zip(counts, seen[0][1], strict=True)):
-            if new - old >= FEW:
-                within = f"{new - old} times within {(now_s - seen[0][0]) / 60.0:.1f} min"
-                what = "its driver gave the same samples twice"
-                if k < outputs.axes:
-                    what = f"{_axis(k, outputs.axes)} sticks: it held one value for a short time"
-                yield from self._once(device, f"often {k}", f"{device}: {what}, {within}", now_s)
+        *new, flipped, alone = [now - before for now, before in zip(counts, seen[0][1], strict=True)]
+        said = {k: "its driver gave the same samples twice" for k in [outputs.axes] if new[k] >= FEW}
+        for k in range(outputs.axes):
+            if new[k] >= FEW:
+                said[k] = f"{_axis(k, outputs.axes)} sticks: it held one value for a short time"
+        if flipped >= max(FEW_FLIPS, FLIPS * alone):
+            new.append(flipped)
+            said[len(new) - 1] = "single samples are off by a power of two (a bit is read wrongly: check cable and bus)"
+        minutes = (now_s - seen[0][0]) / 60.0
+        for k, what in said.items():
+            message = f"{device}: {what}, {new[k]} times within {minutes:.1f} min"
+            yield from self._once(device, f"often {k}", message, now_s)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""

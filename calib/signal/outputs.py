@@ -34,6 +34,9 @@ NEVER, NEVER_S = 1000, 60.0  # samples of an output that never changed
 MOVED, MOVED_S, FEWEST = 3.0, 3.0, 20  # rms of the motion over the resolution, for so long, and so many samples
 SLOW_S = 0.1  # means of so long a time show the motion that any sensor passes
 STICK, STICK_S = 16, 0.1  # equal samples of a fine output that are no chance: once in 1e8
+ALONE = 64.0  # times the usual distance of a sample from the middle of its neighbours: it stands alone
+BETWEEN = 0.25  # of that distance, at most, its neighbours differ
+NEAR_POWER = 1.0 / 32.0  # of a power of two: 9 of 100 distances of any size are so near to one
 ROUNDED = 1.0 + 1e-6  # times the resolution: a device may give decimals
 LEAST_BURST, LEAST_CHANGES = 8, 8  # of a burst that is compared with the one before it
 
@@ -52,13 +55,14 @@ class Outputs:
     """The newest samples of one device: how long each output is held, its resolution and its noise.
 
     `sticks` (A,): how often each output was held for a short time and went on. `repeats`: how many bursts were the same
-    as the burst before them. Both count from the opening.
+    as the burst before them. `alone`: how many single samples stood far from their neighbours, and `flipped`: how many
+    of these by a power of two of the resolution, as where one bit is wrong. All count from the opening.
     """
 
     def __init__(self, axes: int) -> None:
         self.step = np.inf  # the smallest change of any output: the resolution
         self.sticks: NDArray[np.int64] = np.zeros(axes, dtype=np.int64)
-        self.repeats = 0
+        self.repeats = self.alone = self.flipped = 0
         self._taken, self._begun, self._next = (
             0,
             0,
@@ -99,6 +103,7 @@ class Outputs:
         self._follow(first, x)
         self._taken, self._next = self._taken + len(x), first + len(x)
         self._look_for_repeats(x, bursts)
+        self._look_for_flips(x)
         self._find_noise(x)
         width = max(1, round(SLOW_S * rate_hz))
         part = np.vstack([self._part, x])
@@ -178,6 +183,17 @@ class Outputs:
             both = np.vstack([before, burst])
             periodic = any(np.array_equal(both[lag:], both[:-lag]) for lag in range(1, len(burst) // 2 + 1))
             self.repeats += bool(changes >= LEAST_CHANGES and not periodic)
+
+    def _look_for_flips(self, x: Array) -> None:
+        """Samples within the block that stand alone."""
+        away, between = np.abs(x[1:-1] - 0.5 * (x[2:] + x[:-2])), np.abs(x[2:] - x[:-2])
+        if not len(away):
+            return
+        usual = np.maximum(median(np.ascontiguousarray(away.T)), self.step)
+        found = away[(away > ALONE * usual) & (between < BETWEEN * away)] / self.step
+        power = np.exp2(np.round(np.log2(found)))
+        self.alone += len(found)
+        self.flipped += int(np.count_nonzero(np.abs(found - power) < NEAR_POWER * power))
 
     def _find_noise(self, x: Array) -> None:
         size = max(CHUNK, round(CHUNK_S * self._rate_hz))

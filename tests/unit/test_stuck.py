@@ -128,6 +128,28 @@ def test_an_output_that_sticks_now_and_then_is_told() -> None:
     assert said.startswith("s: x sticks: it held one value for a short time, 3 times within ")
 
 
+def test_bits_that_are_read_wrongly_are_told() -> None:
+    random = np.random.default_rng(4)
+    sound = np.round(100.0 * random.normal(size=(12_000, 3)) + [0.0, 0.0, 256_000.0])
+    at, bit = random.random(sound.shape) < 0.01 / 3.0, random.integers(0, 20, sound.shape)
+    flipped = np.where(at, (sound.astype(np.int64) ^ (1 << bit)).astype(np.float64), sound)
+    (said,) = fed(flipped)
+    assert said.startswith(
+        "s: single samples are off by a power of two (a bit is read wrongly: check cable and bus), 1"
+    )
+    knocks = np.where(at, sound + 10.0 ** random.uniform(4.0, 5.7, sound.shape), sound)
+    assert fed(knocks) == fed(sound) == []
+
+
+def test_a_device_that_has_another_number_of_axes_begins_again() -> None:
+    watch, stream, arrivals = RawWatch(600.0), DeviceStream("s", 0), np.array([10**9])
+    for first, axes in ((0, 1), (100, 3), (200, 1)):
+        x, count = np.zeros((100, axes)), np.array([100], dtype=np.int32)
+        block = SampleBlock("s", "boot", 10**9, first, RATE_HZ, arrivals + first * 10**7, count, x)
+        stream.update(block)
+        assert watch.update(block, stream, np.zeros(axes), 0) == []
+
+
 def test_a_restored_watch_goes_on_bit_for_bit() -> None:
     x = np.random.default_rng(3).normal(size=(9000, 3)).round(1)
     whole, first = Outputs(3), Outputs(3)
