@@ -110,18 +110,21 @@ class RawWatch:
         if seen[-1][1] != counts:
             seen.append((now_s, counts))
         self._seen[device] = seen
-        *new, flipped, alone = [now - before for now, before in zip(counts, seen[0][1], strict=True)]
-        said = {k: "its driver gave the same samples twice" for k in [outputs.axes] if new[k] >= FEW}
-        for k in range(outputs.axes):
-            if new[k] >= FEW:
-                said[k] = f"{_axis(k, outputs.axes)} sticks: it held one value for a short time"
+        *sticks, repeats, flipped, alone = [now - before for now, before in zip(counts, seen[0][1], strict=True)]
+        found = [
+            (f"{_axis(k, outputs.axes)} sticks: it held one value for a short time", count)
+            for k, count in enumerate(sticks)
+            if count >= FEW
+        ]
+        if repeats >= FEW:
+            found.append(("its driver gave the same samples twice", repeats))
         if flipped >= max(FEW_FLIPS, FLIPS * alone):
-            new.append(flipped)
-            said[len(new) - 1] = "single samples are off by a power of two (a bit is read wrongly: check cable and bus)"
+            found.append(
+                ("single samples are off by a power of two (a bit is read wrongly: check cable and bus)", flipped)
+            )
         minutes = (now_s - seen[0][0]) / 60.0
-        for k, what in said.items():
-            message = f"{device}: {what}, {new[k]} times within {minutes:.1f} min"
-            yield from self._once(device, f"often {k}", message, now_s)
+        for what, count in found:
+            yield from self._once(device, what, f"{device}: {what}, {count} times within {minutes:.1f} min", now_s)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
