@@ -68,6 +68,11 @@ def highpass(corner_hz: float, order: int = 1) -> Filter:
     return lambda frequency_hz: np.asarray(freqs(b, a, 2.0 * np.pi * frequency_hz)[1])
 
 
+def both(one: Filter, other: Filter) -> Filter:
+    """One filter after the other."""
+    return lambda frequency_hz: one(frequency_hz) * other(frequency_hz)
+
+
 Disturbance = Callable[[np.random.Generator, Array, float], tuple[Array, Array]]
 NOTHING = np.zeros((1, 3))
 

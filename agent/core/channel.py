@@ -75,7 +75,9 @@ class ChannelState:
             return []
         self._time.update(block.t_monotonic_ns, block.t_utc_ns)
         self._streams.by_device[block.device].update(block)
-        results: list[Output] = []
+        scale = 0.0 if self._estimation is None else self._estimation.state.scale
+        wrong = self._streams.watch(block, scale, self._time.origin_utc_ns)
+        results: list[Output] = [self._told(what) for what in wrong]
         if block.device == self.sensor and self._estimation is not None:
             if self._status == "INVALID":
                 self._estimation.gate.regain("")
@@ -166,7 +168,7 @@ class ChannelState:
         results = self._hear_filters(device, json.loads(info_json))
         if not before or before == now:
             return results + ([self._told(f"S and Q are not updated: {not_certified}")] if not_certified else [])
-        self._streams.by_device[device].clear()
+        self._streams.forget(device)
         reason = not_certified or f"the reference is another device now: {now} instead of {before}"
         return results + (self._say_status(reason) or [self._told(reason)])
 

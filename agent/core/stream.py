@@ -103,7 +103,7 @@ class DeviceStream:
     def __init__(self, name: str, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
         """`horizon_s`: the clock model must give times this far back."""
         self._name = name
-        self._origin_ns = origin_ns
+        self.origin_ns = origin_ns
         self._horizon_s = horizon_s
         self._runs: list[Run] = []  # in order of time; of all but the newest there are blocks
         self.newest_arrival_s: float | None = None
@@ -111,7 +111,7 @@ class DeviceStream:
 
     def update(self, block: SampleBlock) -> None:
         """Take the next block."""
-        arrivals_s: Array = (block.burst_t_monotonic_ns - self._origin_ns) * np.float64(1e-9)
+        arrivals_s: Array = (block.burst_t_monotonic_ns - self.origin_ns) * np.float64(1e-9)
         first_arrival_s = float(arrivals_s[0])
         if self.first_sample_s is None:
             self.first_sample_s = first_arrival_s - int(block.burst_count[0]) / block.nominal_rate_hz
@@ -232,7 +232,7 @@ class DeviceStream:
         newest = self._runs[-1:]
         for run in self._runs:
             least = 1 if run is newest[0] else 0
-            while len(run.blocks) > least and (run.blocks[0].t_monotonic_ns - self._origin_ns) * 1e-9 < time_s:
+            while len(run.blocks) > least and (run.blocks[0].t_monotonic_ns - self.origin_ns) * 1e-9 < time_s:
                 run.blocks.popleft()
         self._runs = [run for run in self._runs[:-1] if run.blocks] + newest
 

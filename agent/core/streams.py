@@ -12,6 +12,7 @@ import numpy as np
 from agent.config import Channel
 from agent.core.estimation import DAY_S, Estimation, Judged
 from agent.core.positions import FOUND_WITHIN_S, FoundPositions
+from agent.core.raw_watch import RawWatch
 from agent.core.schedule import Piece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
@@ -19,7 +20,7 @@ from agent.core.windows import Found, limits_of, margin_of, refused, windows_in
 from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
-from calib.model import Pose, Window
+from calib.model import Array, Pose, Window
 from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.timing import HORIZON_S
 from hw.block import LARGEST, SampleBlock
@@ -64,6 +65,7 @@ class Streams:
         self._finder = FoundPositions(channel) if channel.positions else None
         self._places = self._finder or ToldTimes(channel)
         self._runs: dict[str, int] = {}  # of each device, the number of the run of which the last part was
+        self._raw = RawWatch(self._horizon_s)
         self._margin_at: tuple[list[float | None], float] = [], 0.0  # margin in s, and the rates of which it follows
 
     def begin(self, origin_ns: int) -> None:
@@ -98,9 +100,36 @@ class Streams:
         if self._finder is not None:
             self._finder.update(block, self._sensor, estimation.state.scale)
 
+    def watch(self, block: SampleBlock, scale: float, origin_utc_ns: int) -> list[str]:
+        """Take note of a block that `by_device` has taken: what is wrong with its samples, for an operator.
+
+        `scale`: the sensor's sensitivity, in output unit per m/s2, as far as known.
+        """
+        expected = np.zeros(block.indications.shape[1])
+        if block.device == self._channel.sensor:
+            expected = self._expected(scale, len(expected))
+        return self._raw.update(block, self.by_device[block.device], expected, origin_utc_ns)
+
+    def _expected(self, scale: float, axes: int) -> Array:
+        """(A,) rms of the newest motion along each axis of the sensor by its reference, in output unit."""
+        beside, piece = self._beside[0], self._places.piece
+        found = None if beside.reference is None else self._raw.motion(beside.reference)
+        if found is None or piece is None or beside.instrument.derivatives or axes != 3:
+            return np.zeros(axes)
+        direction = piece.pose.direction
+        if direction.shape[1] != len(found):
+            return np.zeros(axes)
+        power = np.einsum("im,mn,in->i", direction, found, direction)
+        return np.asarray(scale / beside.instrument.sensitivity * np.sqrt(np.maximum(power, 0.0)))
+
+    def forget(self, device: str) -> None:
+        """Another device has this name now: samples of the one before are nothing to it."""
+        self.by_device[device].clear()
+        self._raw.forget(device)
+
     def forget_sensor(self) -> None:
         """Another device takes the sensor's place: samples of the one before are nothing to it."""
-        self._sensor.clear()
+        self.forget(self._channel.sensor)
         if self._finder is not None:
             self._finder.forget()
 
@@ -183,7 +212,8 @@ class Streams:
     ) -> Iterator[Verdict]:
         day = first_day + (first_s + piece.stop_s) / DAY_S
         placed, lag_s, anew = Placed(piece.pose, "", {}), 0.0, None
-        if unsound := self._unsound(first_s + piece.start_s, first_s + piece.stop_s):
+        span_s = first_s + piece.start_s, first_s + piece.stop_s
+        if unsound := self._unsound(*span_s) or self._raw.reason(self._in_use, *span_s):
             found = Found([refused(piece, unsound)])
         else:
             self._look_for_restarts(first_s + piece.start_s, first_s + piece.stop_s, estimation)
@@ -215,6 +245,7 @@ class Streams:
             "streams": {name: stream.snapshot() for name, stream in self.by_device.items()},
             "places": self._places.snapshot(),
             "run_numbers": dict(self._runs),
+            "raw": self._raw.snapshot(),
             "piece_number": self._number,
         }
 
@@ -225,6 +256,8 @@ class Streams:
         }
         self._places.load(state["places"])
         self._runs, self._number = dict(state["run_numbers"]), state["piece_number"]
+        if "raw" in state:  # earlier states have none
+            self._raw.load(state["raw"])
 
     @property
     def _sensor(self) -> DeviceStream:

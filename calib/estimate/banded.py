@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib.estimate.deviations import BetweenBands, Deviations, LeftOpen
 from calib.excitation.bands import HIGHEST, RELATED
 from calib.excitation.sums import NOISE_FLOOR
-from calib.model import Array, BandSums
+from calib.model import Array, BandSums, own_channels
 from calib.signal.order_statistics import distinct
 from calib.signal.response import POWERS, Complex, by_term
 
@@ -88,10 +88,10 @@ class Factors:
     """
 
     def __init__(self, bands: BandSums, kept: NDArray[np.int64]) -> None:
-        m, products = bands.reference_channels, bands.products[kept]
+        m, real, products = bands.reference_channels, own_channels(bands.reference_channels), bands.products[kept]
         self.gram, cross = products[:, : 2 * m, : 2 * m], products[:, : 2 * m, 2 * m :]
         powers = np.diagonal(products, axis1=1, axis2=2)
-        self.omega = np.sqrt(powers[:, m : 2 * m].sum(axis=1) / powers[:, :m].sum(axis=1))
+        self.omega = np.sqrt(powers[:, m : m + real].sum(axis=1) / powers[:, :real].sum(axis=1))
         self.middle_hz = np.sqrt(bands.low_hz[kept] * bands.high_hz[kept])
         scale = _unit(powers[:, : 2 * m])
         values, vectors = np.linalg.eigh(self.gram / (scale[:, :, None] * scale[:, None]))
@@ -144,6 +144,7 @@ def _projected(factors: Factors, powers: int, omega2: Array) -> Array:
     """(K, 2M, M) see Banded. `omega2` (M,) is that of each channel in the whole window."""
     bands, m = _as_in_the_window(factors, omega2), factors.gram.shape[1] // 2
     gram = bands.sum(axis=0)
+    gram[m + own_channels(m) :] = gram[:, m + own_channels(m) :] = 0.0  # an integral's derivative is no other motion
     scale = _unit(np.diag(gram))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), RELATED, hermitian=True) / np.outer(scale, scale)
     terms = by_term(factors.omega, powers)
@@ -157,9 +158,12 @@ def _as_in_the_window(factors: Factors, omega2: Array) -> Array:
 
     The power of each channel is multiplied by 1 + b (omega^2 - <omega^2>), with b such that the power of its du/dt over
     that of u is `omega2` (M,), 0 where the channel is silent. A channel that has no more power than its
-    noise, which was subtracted, is silent as well.
+    noise, which was subtracted, is silent as well. An integral has the motion of its own channel.
     """
-    power, rate_power = np.split(np.diagonal(factors.gram, axis1=1, axis2=2), 2, axis=1)
+    m = factors.gram.shape[1] // 2
+    real = own_channels(m)
+    powers, omega2 = np.diagonal(factors.gram, axis1=1, axis2=2), omega2[:real]
+    power, rate_power = powers[:, :real], powers[:, m : m + real]
     square = np.divide(rate_power, power, out=np.zeros_like(power), where=power > 0.0)
     total = power.sum(axis=0)
     share = np.divide(power, total, out=np.zeros_like(power), where=total > 0.0)
@@ -168,7 +172,7 @@ def _as_in_the_window(factors: Factors, omega2: Array) -> Array:
     told = (omega2 > 0.0) & (spread > (NARROW * mean) ** 2)  # in a narrow band nothing can be made wider
     wider = np.divide(omega2 - mean, spread, out=np.zeros_like(mean), where=told)
     times = (1.0 + wider * (square - mean)).clip(1.0 / MOST_TAPERED, MOST_TAPERED)
-    root = np.tile(np.sqrt(times), 2)
+    root = np.tile(np.sqrt(times), 2 * m // real)
     return np.asarray(root[:, :, None] * root[:, None] * factors.gram)
 
 

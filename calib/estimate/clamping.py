@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.distributions import chi2_quantile
+from calib.excitation.bands import without_integrals
 from calib.excitation.sums import merge, pool
 from calib.model import Array, Window
 
@@ -213,7 +214,7 @@ def _rattle(count: Array, scatter: Array, slopes: Array, scale: float) -> tuple[
 
 def _bands(windows: Sequence[Window], expected: Array) -> tuple[ClampBand, ...]:
     """Coherence and gain by half octave, where there are enough points."""
-    told = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
+    told = [without_integrals(w.bands) for w in windows if w.bands is not None and len(w.bands.points)]
     if not told:
         return ()
     low, high = (np.concatenate([getattr(b, name) for b in told]) for name in ("low_hz", "high_hz"))

@@ -17,6 +17,7 @@ from calib.estimate.banded import Factors
 from calib.estimate.deviations import PROBABILITY
 from calib.estimate.quantities import LAG, RESPONSE
 from calib.estimate.response_told import BandSensitivity, Known, ResponseTold
+from calib.excitation.bands import without_integrals
 from calib.excitation.excited import excited_together
 from calib.model import Array, BandSums, Pose, Window
 from calib.signal.response import Complex
@@ -55,7 +56,7 @@ _Moved = tuple[Pose, BandSums]  # how a window stands, and its bands
 def _moved(windows: Sequence[Window]) -> list[_Moved]:
     """What is used of the windows that have bands."""
     found = [(own.pose, own.bands) for own in excited_together([w for w in windows if w.used])[0]]
-    return [(pose, bands) for pose, bands in found if bands is not None]
+    return [(pose, without_integrals(bands)) for pose, bands in found if bands is not None]
 
 
 def _bands(windows: Sequence[_Moved], edges_hz: Array, taken: Complex, stated: Array) -> tuple[BandSensitivity, ...]:

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.model import Array, BandSums, Window
+from calib.model import Array, BandSums, Window, own_channels
 from calib.signal.band import hanning
 from calib.signal.order_statistics import distinct, median
 from calib.signal.response import Complex
@@ -40,13 +40,12 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
     """Band sums of evenly sampled u (n, m) in m/s2, du (n, m) in m/s3 and V (n, 3) in output unit.
 
     `share` of the window is tapered at each end. With HANN motion that is much stronger at other frequencies does not
-    leak into a band; the sums then have the weight of half of the points.
-    None where the window is too short for a few bands, and without a reference or with its integrals
-    (calib.signal.corner).
+    leak into a band; the sums then have the weight of half of the points. u may hold the integrals of a reference as
+    well (calib.signal.corner). None where the window is too short for a few bands, and without a reference.
     """
     n, m = u.shape
-    fewest = 2 * m + MORE_LINES
-    if m not in (1, 3) or n < 2 * FEWEST_BANDS * fewest:
+    fewest = 2 * own_channels(m) + MORE_LINES
+    if not m or n < 2 * FEWEST_BANDS * fewest:
         return None
     taper, density = _taper(n, share)
     rows = np.vstack([u.T, du.T, V.T])
@@ -58,7 +57,7 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
     own = [lines[:, a:b] for a, b in itertools.pairwise(edges.tolist())]
     products = np.array([(part @ part.conj().T).real for part in own])
     ends_hz = np.append(frequency_hz, 0.5 * rate_hz)[edges]
-    nothing, lasting = np.zeros((len(products), 2 * m + 3)), np.array([_lasting(part[:m]) for part in own])
+    nothing, lasting = np.zeros((len(products), 2 * m + 3)), np.array([_lasting(part[: own_channels(m)]) for part in own])
     return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing, lasting)
 
 
@@ -85,26 +84,36 @@ def beside_noise(bands: BandSums, sensor_noise: Array) -> BandSums:
     return replace(bands, noise=noise)
 
 
+def without_integrals(bands: BandSums) -> BandSums:
+    """The bands of the reference's own channels, without their integrals (calib.signal.corner)."""
+    channels, m = bands.reference_channels, own_channels(bands.reference_channels)
+    if channels == m:
+        return bands
+    kept = np.r_[0:m, channels : channels + m, 2 * channels : 2 * channels + 3]
+    products = bands.products[:, kept[:, None], kept]
+    return replace(bands, reference_channels=m, products=products, noise=bands.noise[:, kept])
+
+
 def without_noise(bands: BandSums, noise: Array) -> BandSums:
     """The bands with motion, the power of the reference's white noise subtracted.
 
     `noise` (2, m): its rms in u and du/dt. Their ratio tells up to which frequency it is.
     """
-    m, total = noise.shape[1], float(bands.points.sum())
+    m, channels, total = noise.shape[1], bands.reference_channels, float(bands.points.sum())
     power = np.zeros_like(bands.noise)
     power[:, -3:] = bands.noise[:, -3:]
     kept = np.ones(len(power), dtype=bool)
     own = bands.products.diagonal(axis1=1, axis2=2)
-    moved, moved_rate = own[:, :m].sum(axis=1), own[:, m : 2 * m].sum(axis=1)
+    moved, moved_rate = own[:, :m].sum(axis=1), own[:, channels : channels + m].sum(axis=1)
     for k in np.flatnonzero(noise[0] > 0.0):
         end_hz = np.sqrt(3.0) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
         low, high = np.minimum(bands.low_hz, end_hz), np.minimum(bands.high_hz, end_hz)
         power[:, k] = total * noise[0, k] ** 2 * (high - low) / end_hz
-        power[:, m + k] = total * noise[1, k] ** 2 * (high**3 - low**3) / end_hz**3
-        kept &= (moved > OVER_NOISE * power[:, k]) & (moved_rate > OVER_NOISE * power[:, m + k])
+        power[:, channels + k] = total * noise[1, k] ** 2 * (high**3 - low**3) / end_hz**3
+        kept &= (moved > OVER_NOISE * power[:, k]) & (moved_rate > OVER_NOISE * power[:, channels + k])
         kept &= bands.high_hz <= end_hz
     products = bands.products.copy()
-    products[:, range(2 * m), range(2 * m)] -= power[:, : 2 * m]
+    products[:, range(2 * channels), range(2 * channels)] -= power[:, : 2 * channels]
     return parts(replace(bands, products=products, noise=power), kept)
 
 
@@ -139,7 +148,7 @@ def share_above(bands: BandSums | None, to_hz: float) -> float:
     """
     if bands is None:
         return 0.0
-    m = bands.reference_channels
+    m = own_channels(bands.reference_channels)
     power = np.trace(bands.products[:, :m, :m], axis1=1, axis2=2)
     part = ((bands.high_hz - to_hz) / (bands.high_hz - bands.low_hz)).clip(0.0, 1.0)
     return float(power @ part / max(power.sum(), np.finfo(float).tiny))
@@ -197,6 +206,7 @@ def _end(edge: Array, order: Array, power: Array, outside: float) -> float:
 def _powers(bands: BandSums, *, lasting: bool = False) -> tuple[Array, Array]:
     """The power of the motion and of its derivative, in each band of a window; 0 in bands that are incoherent.
     `lasting` as in motion_band_hz."""
+    bands = without_integrals(bands)
     m, powers = bands.reference_channels, np.diagonal(bands.products, axis1=1, axis2=2)
     power, square = powers[:, :m].sum(axis=1), powers[:, m : 2 * m].sum(axis=1)
     if lasting:

@@ -91,10 +91,10 @@ class Excitation:
     def bands(self) -> BandSums | None:
         """The bands with motion after the correction."""
         bands, live = self.window.bands, self.live
-        if bands is None or bands.reference_channels != len(live):
+        if bands is None or own_channels(bands.reference_channels) != len(live):
             return None
         if not live.all():
-            both = _columns(live, len(live))
+            both = _columns(live, bands.reference_channels)
             bands = replace(bands, products=np.where(np.outer(both, both), bands.products, 0.0))
         return without_noise(bands, np.sqrt(self.noise))
 

@@ -7,7 +7,7 @@ band of the motion; the windows found in them get their verdicts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -17,9 +17,11 @@ from calib.excitation import detection
 from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
 from calib.excitation.bands import TAPER, beside_noise
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
+from calib.excitation.hum import hum_hz, without_lines
+from calib.excitation.sustained import sustained_hz
 from calib.excitation.turning import feels_gravity, standing_parts
-from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
-from calib.excitation.windows import Points, at_rest, motion_windows, rest_window, still_window
+from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, disproportionate
+from calib.excitation.windows import CALM, Points, at_rest, motion_windows, rest_window, still_window
 from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
 from calib.signal.band import band_above_noise, lowpass, without_short_holes, without_slow
 from calib.signal.corner import integral, with_integral, without_corner
@@ -44,6 +46,7 @@ MOST_MARGIN_S = 5.0  # a second derivative at 10 Hz takes 4.2 s
 MOST_MISSING_PCT = 5.0
 # A sensor that follows the motion better, with fewer knocks, needs no other weights of the frequencies.
 COHERENT, KNOCKED_PCT = 0.999, 1.0
+CALM_SHARE = 0.25  # of the time that moves as well, but weakly: a window is cut into pieces where shocks end
 # Of the motion in a window: with fewer, its spectrum is that of the window's ends, and it shows no direction but one.
 FEWEST_CYCLES = 2.0
 LEAST_CYCLES, LEAST_LONG_CYCLES, LONG_S = 1.0, 0.5, 10.0  # a few ms of lag bend a long turn less than a short one
@@ -178,6 +181,10 @@ def aligned(
     rows[:3], rows[3 : 3 + k], rows[3 + k :] = V.T, at.u.T, at.du.T
     rows[:, ~at.usable] = np.nan
     columns = rows.T
+    shown = np.isfinite(columns).all(axis=1) & inside
+    hums_hz = hum_hz(columns[shown, 3 : 3 + m], columns[shown, :3], sensor_rate_hz) if settings.limit_band else []
+    if hums_hz:
+        columns = without_lines(columns, sensor_rate_hz, hums_hz)
     band_hz, noise = band_to_keep(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
     clipped, independent, unfiltered = 0, 1.0, columns
     if band_hz is not None and settings.limit_band:
@@ -202,6 +209,7 @@ def aligned(
         "filled_samples": (filled & usable).sum(),
         "reference_filled_samples": (raw_filled & raw_inside).sum(),
         "reference_glitches": (odd & raw_inside).sum(),
+        "hum_lines": len(hums_hz),
     }
     kept = as_slice(np.flatnonzero(usable))
     points = Points(time_s[kept], *np.split(columns.T[:, kept].T, [3, 3 + k], axis=1))
@@ -259,9 +267,13 @@ def _motion(
     align = partial(aligned, sensor, reference, instrument, span_s, lag_s, settings, response)
     if (found := align()) is None:
         return []
-    if instrument.has_corner:
-        pose = with_integral(pose)
+    stands, pose = pose, with_integral(pose) if instrument.has_corner else pose
     made = _beside(pose, found, settings)
+    if settings.limit_band and settings.to_hz is None and (lasting_hz := _beside_shocks(found.points, made)):
+        limited = replace(settings, to_hz=lasting_hz)
+        within = _motion(stands, sensor, reference, instrument, span_s, lag_s, limited, response)
+        if any(window.used for window in within):
+            return within
     knocked = any(100.0 * w.left_out > KNOCKED_PCT * (w.points + w.left_out) for w in made)
     against = None
     if settings.limit_band and (knocked or any(w.numbers.get("coherence", 1.0) < COHERENT for w in made)):
@@ -277,6 +289,20 @@ def _motion(
     # Where the noise of the reference is stated, all other noise is the sensor's.
     sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
     return [w if w.bands is None else replace(w, bands=_noisy(w.bands, sensor_noise, against)) for w in made]
+
+
+def _beside_shocks(points: Points, made: Sequence[Window]) -> float | None:
+    """The upper end in Hz of the motion that lasts, where shocks beside it keep it from being used; else None.
+
+    In such windows the output seems not to be proportional, or much of their time is calm compared with the shocks.
+    """
+    calm_s = sum(w.stop_s - w.start_s for w in made if w.reason == CALM)
+    if not any(disproportionate(w.numbers) for w in made) and calm_s <= CALM_SHARE * (
+        made[-1].stop_s - made[0].start_s
+    ):
+        return None
+    rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
+    return sustained_hz(points.u[:, : own_channels(points.u.shape[1])], rate_hz)
 
 
 def _noisy(bands: BandSums, sensor_noise: Array, against: NoiseFilter | None) -> BandSums:

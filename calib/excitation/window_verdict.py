@@ -86,6 +86,11 @@ def judge(sums: WindowSums, struck: NDArray[np.bool_], numbers: Mapping[str, flo
     return Verdict(not (reason := _reason(numbers)), reason, numbers)
 
 
+def disproportionate(n: Mapping[str, float]) -> bool:
+    """Whether the output of a window with these numbers is not proportional to the motion."""
+    return "nonlinearity_pct" in n and n["nonlinearity_pct"] > n["nonlinearity_pct_threshold"]
+
+
 def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
     """The limit of each statistic. It is recorded beside the statistic: a reader sees how close a decision was."""
     limit = {"points": float(limits.least_points), "left_out_pct": limits.most_left_out_pct}
@@ -139,7 +144,7 @@ def _reason(n: Mapping[str, float]) -> str:
             f"the sensor's mean changes by {n['step_mps2']:.3g} m/s2 from one part of the window to the other, "
             f"{limit['step_mps2']:.3g} m/s2 at most by the stated uncertainties of angle and offset"
         )
-    if "nonlinearity_pct" in n and n["nonlinearity_pct"] > limit["nonlinearity_pct"]:
+    if disproportionate(n):
         return (
             f"the output is not proportional to the motion: where the motion is strongest, the sensitivity differs by "
             f"{n['nonlinearity_pct']:.1f} %, {limit['nonlinearity_pct']:.1f} % at most (a mount that slips or rattles?)"

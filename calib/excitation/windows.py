@@ -27,6 +27,7 @@ from calib.model import Array, BandSums, Pose, Window, WindowSums
 from calib.signal.order_statistics import median
 from calib.signal.stamps import OFF_S
 
+CALM = "the reference is calm here"  # compared with the rest of the samples
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
 
@@ -246,7 +247,7 @@ def _motion(
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
     verdict = judge(sums, struck, numbers, limits)
     if kind == "quiet" and verdict.used:
-        verdict = Verdict(False, "the reference is calm here", verdict.numbers)
+        verdict = Verdict(False, CALM, verdict.numbers)
     window = _window(kind, pose, t, sums, verdict, int(struck.sum()) if leave_out else 0)
     if not (taper and verdict.used):
         return window

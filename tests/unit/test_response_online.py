@@ -12,12 +12,13 @@ import pytest
 from agent.core.events import Acceleration, CalibrationUpdate, Event
 from agent.core.pipeline import Pipeline
 from agent.recording.messages import decode, encode, schema_of
+from benchmarks.online.config import building_config
 from benchmarks.online.node import Node, Stated, Timing, node
 from benchmarks.online.runner import Run, visits
 from calib.model import Array
 from hw.virtual.building import Building
 from hw.virtual.building_motion import Band
-from tests.pair import Filter, flat, lowpass, moving_mean, resonance
+from tests.pair import Filter, both, flat, highpass, lowpass, moving_mean, resonance
 
 SEED, WINDOWS = 1, 8
 BROAD = Band(0.5, 12.0)
@@ -125,6 +126,31 @@ def test_windows_at_one_frequency_before_count_as_what_they_are():
         )
     )
     assert deviation_pct(found, np.array(without.sensitivity) * size(name, found)) < 2.0 * SAME_PCT
+
+
+def test_beside_an_ac_coupled_reference_the_response_is_told_as_beside_another_one():
+    """The corner is stated as it is. What the filters do was told as another corner, by 12 of its uncertainties."""
+    corner_hz, found, states = 0.05, {}, {}
+    for name, coupling, stated in (
+        ("dc", flat, {}),
+        ("ac", highpass(corner_hz), {"corner_hz": corner_hz, "u_corner_hz": 0.1 * corner_hz}),
+    ):
+        drawn, building = filtered(lowpass(2, 31.0))
+        reference = replace(building.parameters.reference, response=both(lowpass(2, 80.0), coupling))
+        building = Building(replace(building.parameters, reference=reference), SEED)
+        keys = drawn.stated.keys()
+        run = Run(building_config(building, **keys | {"certificate": keys["certificate"] | stated}))
+        results = [result for event in visits(building, range(WINDOWS)) for result in run.feed(event)]
+        found[name] = [result for result in results if isinstance(result, CalibrationUpdate)][-1]
+        states[name] = run.pipeline._channels[0]._estimation.state
+        run.close()
+    corner = next(q.key for q in states["ac"].quantities if "corner" in q.key)
+    value, u = states["ac"].quantity(corner)
+    assert abs(value - corner_hz) < 3.0 * u < 0.1 * corner_hz
+    assert found["ac"].windows == found["dc"].windows >= WINDOWS - 1
+    assert found["ac"].reference_frequency_hz == pytest.approx(found["dc"].reference_frequency_hz, rel=0.05)
+    assert deviation_pct(found["ac"], np.array(found["dc"].sensitivity)) < SAME_PCT
+    assert len(found["ac"].response) == len(found["dc"].response)
 
 
 def test_a_restored_state_goes_on_bit_for_bit():
