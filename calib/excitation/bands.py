@@ -57,7 +57,8 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
     own = [lines[:, a:b] for a, b in itertools.pairwise(edges.tolist())]
     products = np.array([(part @ part.conj().T).real for part in own])
     ends_hz = np.append(frequency_hz, 0.5 * rate_hz)[edges]
-    nothing, lasting = np.zeros((len(products), 2 * m + 3)), np.array([_lasting(part[: own_channels(m)]) for part in own])
+    nothing, moved = np.zeros((len(products), 2 * m + 3)), own_channels(m)
+    lasting = np.array([_lasting(part[:moved]) for part in own])
     return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing, lasting)
 
 
