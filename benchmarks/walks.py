@@ -42,7 +42,7 @@ RATES_PCT = (0.5, 2.0, 10.0)  # a year, of S_xx, S_yy, S_zz: three channels of t
 DAYS = (30.0, 120.0, 365.0)
 U_REFERENCE_PCT = 0.3
 WALK_PCT, STABILITY_PCT = Process().sensitivity_pct, Certificate().stability_pct
-EACH_DAY, THEN_DAYS = 40, 6.0  # a record each day at first, later every six days
+EACH_DAY, THEN_DAYS = 40, 12.0  # a record each day at first, later every twelve days
 DEFAULTS = ((0.005, 0.5), (0.052, 0.5), (0.026, 0.5), (WALK_PCT, STABILITY_PCT))
 SEED = 90_000
 
@@ -165,21 +165,21 @@ def rows(runs: int) -> None:
     for rate, k, name in zip(RATES_PCT, MAIN, ("Sxx", "Syy", "Szz"), strict=True):
         _row(f"S drifts by {rate:g} % a year, 365 days", lives, [k], name)
     leaning = np.deg2rad(1.0) / 30.4 * STANDARD_GRAVITY_MPS2
-    days = np.arange(60.0)
+    days = np.arange(45.0)
     lives = [
         lived(stated, days, seed, lambda _: np.eye(3), none, lambda day: np.array([leaning * day, 0.0, 0.0]), 12)
         for seed in range(runs)
     ]
-    _row("the mount tilts by 1 deg a month, 60 days", lives, [9, 10, 11], "Qx")
-    step = 20.0
+    _row("the mount tilts by 1 deg a month, 45 days", lives, [9, 10, 11], "Qx")
+    step = 12.0
     lives = [
         lived(
-            stated, np.arange(0.0, 40.0, 0.25), seed, lambda _: np.eye(3),
+            stated, np.arange(0.0, 20.0, 0.25), seed, lambda _: np.eye(3),
             lambda day: np.array([0.0, 0.007 * (day >= step), 0.0]), none,
         )
         for seed in range(runs)
     ]  # fmt: skip
-    _row("reference y steps by 0.7 % on day 20", lives, [4], "Syy")
+    _row("reference y steps by 0.7 % on day 12, four windows a day", lives, [4], "Syy")
     grown = [life.u[-1, 4] / life.u[life.days < step][-1, 4] for life in lives]
     print(f"\nu(S_yy) after the step over u before it: {min(grown):.2f} to {max(grown):.2f}")
 
@@ -201,17 +201,17 @@ def _row(what: str, lives: Sequence[Life], which: Sequence[int], parameter: str)
 
 def sound(runs: int) -> None:
     """Sensors that walk as stated, with their references and mounts, four years each."""
-    stated, years = channel(WALK_PCT, STABILITY_PCT), 4.0
+    stated, years, each_days = channel(WALK_PCT, STABILITY_PCT), 4.0, 7.0
     alarms, widened, beyond, windows = [], [], 0, 0
     for seed in range(runs):
         random = np.random.default_rng([SEED, 1, seed])
-        days = np.arange(0.0, years * YEAR_DAYS, 5.0)
-        walks = random.normal(size=(len(days), 9)) * WALK_PCT / 100.0 * np.sqrt(5.0)
+        days = np.arange(0.0, years * YEAR_DAYS, each_days)
+        walks = random.normal(size=(len(days), 9)) * WALK_PCT / 100.0 * np.sqrt(each_days)
         S = dict(zip(days.tolist(), np.eye(3) + np.cumsum(walks, axis=0).reshape(-1, 3, 3), strict=True))
-        walks = random.normal(size=(len(days), 3)) * STABILITY_PCT / 100.0 * np.sqrt(5.0 / YEAR_DAYS)
+        walks = random.normal(size=(len(days), 3)) * STABILITY_PCT / 100.0 * np.sqrt(each_days / YEAR_DAYS)
         reference = dict(zip(days.tolist(), np.cumsum(walks, axis=0), strict=True))
         process = Process()
-        walks = random.normal(size=(len(days), 3)) * process.offset_mps2 * np.sqrt(5.0)
+        walks = random.normal(size=(len(days), 3)) * process.offset_mps2 * np.sqrt(each_days)
         mean = random.normal(size=3) * process.offset_rate_mps2 * days[:, None] + np.cumsum(walks, axis=0)
         means = dict(zip(days.tolist(), mean, strict=True))
         life = lived(stated, days, seed, S.__getitem__, reference.__getitem__, means.__getitem__, 12)
@@ -235,7 +235,7 @@ def alarms(runs: int) -> None:
         walks = Walks(rate)
         makers = [{f"{p}": (1.0, 1.0), "r": (1.0, 1.0)} for p in range(12)]
         for day, value in enumerate(values):
-            shown = Shown(float(day), value, zero, zero, a_day, zero, zero, makers)
+            shown = Shown(float(day), value, zero, zero, a_day, zero, zero, makers, True)
             told += len([v for v in walks.update({"A": shown}) if v.verdict == "drifting"])
             wide += bool(walks.widened)
             if walks.drifting:

@@ -39,6 +39,7 @@ SHARED = 0.3  # of the scale: what moves a parameter less cannot have changed it
 PARTED = 0.5  # of a change: how much of it another reference shows tells which device has changed
 NEAR = 0.25  # of a span: where the same span of another reference must begin
 AGAIN = 2.0  # a change that was told is told again when it is so many times as large
+MOST_REFERENCES = 8  # that are remembered
 Makers = Mapping[str, tuple[float, float]]
 
 
@@ -48,7 +49,7 @@ class Shown:
 
     What is stated of a change: the variance of its `walk` a day, that of its steady `rate`, and that of the walk of its
     rate. `makers`: what may have made a change of each parameter, by key: how far it moves for one unit of the change,
-    and the variance a day of its own walk.
+    and the variance a day of its own walk. `fixed`: the mount never turned, and the mean output is in the place of Q.
     """
 
     day: float
@@ -59,6 +60,7 @@ class Shown:
     rate: Array
     rate_walk: Array
     makers: Sequence[Makers]
+    fixed: bool
 
 
 def shown(now: Now, record: Record, *, fixed: bool) -> Shown:
@@ -83,7 +85,7 @@ def shown(now: Now, record: Record, *, fixed: bool) -> Shown:
     return Shown(
         now.day, jacobian @ now.mean, np.sum(half**2, axis=1),
         np.append(none, np.sum(half[9:] * now.factor[rates], axis=1)),
-        jacobian**2 @ a_day, np.append(none, u[rates] ** 2), np.append(none, a_day[rates]), makers,
+        jacobian**2 @ a_day, np.append(none, u[rates] ** 2), np.append(none, a_day[rates]), makers, fixed,
     )  # fmt: skip
 
 
@@ -168,6 +170,7 @@ class Walks:
         self._told: dict[tuple[str, int], _Told] = {}
         self._past: list[Widening] = []  # of before a restart
         self._ended: list[int] = []  # parameters whose verdict ended with it
+        self._fixed = True
         self.widened: list[Widening] = []
 
     @property
@@ -182,15 +185,20 @@ class Walks:
 
     def update(self, by_reference: Mapping[str, Shown]) -> list[DriftVerdict]:
         """Take what each reference shows. Returns the verdicts that are to be told."""
+        if self._fixed and not all(now.fixed for now in by_reference.values()):
+            self.restart()
+            self._fixed = False
         news = [DriftVerdict(PARAMETERS[p]) for p in self._ended]
-        self._ended, self.widened = [], list(self._past)
+        self._ended, self.widened = [], []
         for k, (reference, now) in enumerate(by_reference.items()):
-            course = self._courses.get(reference, _Course.begun())
+            course = self._courses.pop(reference, _Course.begun())
             if (found := course.changes(now)) is not None:
                 for p in range(12 if k == 0 else 9):
                     size, sd, since = (float(values[p]) for values in found)
                     news += self._judged(reference, p, size, sd, since, by_reference)
             self._courses[reference] = course.after(now)
+        self._courses = dict(list(self._courses.items())[-MOST_REFERENCES:])
+        self.widened += [*self._past, *(told.widening for told in self._told.values())]
         return news
 
     def _judged(
@@ -200,7 +208,6 @@ class Walks:
         threshold = self.threshold(len(by_reference))
         statistic = 0.5 * (size / sd) ** 2
         if before is not None and abs(size) <= abs(before.size):
-            self.widened.append(before.widening)
             return []
         if before is None and statistic <= threshold:
             if abs(size) > WIDENS * sd and len(now.makers[p]) > 1:
@@ -208,7 +215,6 @@ class Walks:
             return []
         makers, cause = self._cause(reference, p, size, since, by_reference)
         told = _Told(reference, p, size, abs(size), _widening(makers, size, since, now.day))
-        self.widened.append(told.widening)
         if before is not None and abs(size) < AGAIN * before.said:
             self._told[reference, p] = replace(told, said=before.said)
             return []
@@ -243,8 +249,8 @@ class Walks:
                     f"reference {reference}, because {other} does not show it; have it calibrated"
                 )
         return makers, (
-            "sensor or reference (the data cannot tell which); U covers either from now on. Have the reference "
-            "calibrated, or add a second one"
+            "sensor or reference (the data cannot tell which); U covers either until gravity, a second reference or an "
+            "operator tells. Have the reference calibrated"
         )
 
     def restart(self) -> None:
@@ -265,6 +271,7 @@ class Walks:
             "told": [asdict(told) for told in self._told.values()],
             "past": [asdict(widening) for widening in self._past],
             "ended": list(self._ended),
+            "fixed": self._fixed,
             "widened": [asdict(widening) for widening in self.widened],
         }
 
@@ -274,7 +281,7 @@ class Walks:
         loaded = (_Told(**{**told, "widening": Widening(**told["widening"])}) for told in state["told"])
         self._told = {(told.reference, told.parameter): told for told in loaded}
         self._past = [Widening(**widening) for widening in state["past"]]
-        self._ended = list(state["ended"])
+        self._ended, self._fixed = list(state["ended"]), state["fixed"]
         self.widened = [Widening(**widening) for widening in state["widened"]]
 
 

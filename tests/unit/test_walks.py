@@ -30,7 +30,7 @@ THRESHOLD = 11.2
 
 def seen(day: float, value: Array, *makers: str) -> Shown:
     by_parameter = [dict.fromkeys((f"S{p}", *makers), (1.0, WALK**2)) for p in range(12)]
-    return Shown(day, value, ZERO, ZERO, WALK**2 * ONES, ZERO, ZERO, by_parameter)
+    return Shown(day, value, ZERO, ZERO, WALK**2 * ONES, ZERO, ZERO, by_parameter, True)
 
 
 def told(walks: Walks, courses: Mapping[str, Array], first: int = 0) -> list[tuple[int, DriftVerdict]]:
