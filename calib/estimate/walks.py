@@ -34,7 +34,8 @@ from calib.model import PARAMETERS, Array, own_channels
 SHORTEST_DAYS, LONGEST_DAYS = 7, 1461
 DENSE = 8  # of the days before, all of the newest are kept, and eight in each octave of age
 WIDENS = 2.5  # standard deviations: with two equal walks and the error of a certificate, U covers a smaller change
-SURELY = 1.6  # U = 2 u covers the errors 0 and d if u is d / 1.6
+# U = 2 u covers the errors 0 and d if u is d / 1.6; a tenth more is for what has come since the newest day.
+SURELY = 1.4
 SHARED = 0.3  # of the scale: what moves a parameter less cannot have changed it
 PARTED = 0.5  # of a change: how much of it another reference shows tells which device has changed
 NEAR = 0.25  # of a span: where the same span of another reference must begin
@@ -124,8 +125,9 @@ class _Course:
         keep = (numbers % (1 << octave) == 0) & (now.day - days <= LONGEST_DAYS)
         return _Course(days[keep], numbers[keep], kept[keep])
 
-    def changes(self, now: Shown) -> tuple[Array, Array, Array] | None:
-        """(12,) the most significant net changes, their standard deviations, and the days on which they began."""
+    def changes(self, now: Shown) -> tuple[Array, Array] | None:
+        """Sizes, standard deviations and first days (3, 12) of net changes: the most significant ones, and the largest
+        of those beyond WIDENS standard deviations (0 where there is none)."""
         span = now.day - self.days
         long = (span >= SHORTEST_DAYS) & (span <= LONGEST_DAYS)
         if not long.any():
@@ -135,8 +137,11 @@ class _Course:
         own = np.maximum(kept[:, 1] - now.variance + 2.0 * span * kept[:, 2], 0.0)
         stated = now.walk * span + now.rate * span**2 + now.rate_walk * span**3 / 3.0
         sd = np.where(stated > 0.0, np.sqrt(stated + own), np.inf)
-        best = np.argmax(np.abs(size) / sd, axis=0), np.arange(12)
-        return size[best], sd[best], self.days[long][best[0]]
+        found = np.array([size, sd, np.broadcast_to(self.days[long, None], size.shape)])
+        far = np.where(np.abs(size) > WIDENS * sd, size, 0.0)
+        best, most = (np.argmax(np.abs(by), axis=0) for by in (size / sd, far))
+        every = np.arange(12)
+        return found[:, best, every], np.where(far[most, every] != 0.0, found[:, most, every], 0.0)
 
     def change(self, p: int, since: float, now: Shown) -> float | None:
         """The net change of one parameter since about that day; None where no such day is kept."""
@@ -194,23 +199,28 @@ class Walks:
             course = self._courses.pop(reference, _Course.begun())
             if (found := course.changes(now)) is not None:
                 for p in range(12 if k == 0 else 9):
-                    size, sd, since = (float(values[p]) for values in found)
-                    news += self._judged(reference, p, size, sd, since, by_reference)
+                    best, most = (values[:, p].tolist() for values in found)
+                    news += self._judged(reference, p, best, most, by_reference)
             self._courses[reference] = course.after(now)
         self._courses = dict(list(self._courses.items())[-MOST_REFERENCES:])
         self.widened += [*self._past, *(told.widening for told in self._told.values())]
         return news
 
     def _judged(
-        self, reference: str, p: int, size: float, sd: float, since: float, by_reference: Mapping[str, Shown]
+        self,
+        reference: str,
+        p: int,
+        best: Sequence[float],
+        most: Sequence[float],
+        by_reference: Mapping[str, Shown],
     ) -> list[DriftVerdict]:
         before, now = self._told.get((reference, p)), by_reference[reference]
-        threshold = self.threshold(len(by_reference))
-        statistic = 0.5 * (size / sd) ** 2
-        if before is not None and abs(size) <= abs(before.size):
+        threshold, statistic = self.threshold(len(by_reference)), 0.5 * (best[0] / best[1]) ** 2
+        size, sd, since = most
+        if abs(size) <= (0.0 if before is None else abs(before.size)):
             return []
         if before is None and statistic <= threshold:
-            if abs(size) > WIDENS * sd and len(now.makers[p]) > 1:
+            if len(now.makers[p]) > 1:
                 self.widened.append(_widening(now.makers[p], size, since, now.day))
             return []
         makers, cause = self._cause(reference, p, size, since, by_reference)

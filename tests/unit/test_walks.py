@@ -91,7 +91,7 @@ def test_as_long_as_nothing_tells_both_may_have_made_half_of_it_and_it_is_told_a
     days = [day for day, _ in told(walks, {"A": ramp(100, WALK)})]
     assert days == [23, 46, 92]
     (widening,) = walks.widened
-    share = (99 * WALK / 1.6) ** 2 / 2.0 - 99 * WALK**2  # U = 2 u covers either; the stated walk is part of it
+    share = (99 * WALK / 1.4) ** 2 / 2.0 - 99 * WALK**2  # U = 2 u covers either; the stated walk is part of it
     assert widening.u == pytest.approx({f"S{SYY}": np.sqrt(share), "A": np.sqrt(share)})
 
 
