@@ -118,9 +118,9 @@ def drawn(
 ) -> Record:
     """One record of so many windows of a sensor with the sensitivity `S` (3, 3) beside a reference that indicates
     1 + `reference` (3,) times too much; `mean` (3,) is added to the mean output."""
-    own = replace(TEMPLATE, root=TEMPLATE.root * np.sqrt(windows), count=TEMPLATE.count * windows)
+    own = replace(TEMPLATE, root=TEMPLATE.root * np.sqrt(windows), count=TEMPLATE.count * windows, windows=windows)
     slopes = own.root[:, :3] @ (S / (1.0 + reference)).T + own.noise * random.normal(size=(6, 3))
-    means = S @ GRAVITY + mean + 0.02 * random.normal(size=3)  # of the stated scatter of 0.05 m/s2
+    means = S @ GRAVITY + mean + 0.05 / np.sqrt(windows) * random.normal(size=3)  # the scatter of windows, as stated
     return replace(own, day=day, days=(day, day), slopes=slopes, means=means[None])
 
 
@@ -151,7 +151,7 @@ def defaults(_: int) -> None:
         ratio = np.abs(life.errors / life.u)[:, MAIN]
         rows = [np.searchsorted(life.days, day) for day in DAYS]
         by_rate = [", ".join(f"{ratio[row, k]:.1f}" for row in rows) for k in range(3)]
-        told = ", ".join(f"{life.told_of(p):.0f}" for p in ("Sxx", "Syy", "Szz"))
+        told = ", ".join(f"{life.told_of(p):.0f}".replace("nan", "never") for p in ("Sxx", "Syy", "Szz"))
         u = 100.0 * sound.u[-1, MAIN].mean()
         print(f"| {walk:g} ({walk * YEAR_DAYS**0.5:.2f}) | {stability:g} | {u:.3f} | {' | '.join(by_rate)} | {told} |")
 

@@ -67,7 +67,9 @@ def gauss_newton(
     for passes in range(1, MOST_PASSES + 1):
         lines = lines_at(x)
         for _ in range(MOST_HALVINGS):
-            if best is None or lines.chi2 + walked <= least * (1.0 + ROUNDING) + (BESIDE if lines.passages else ROUNDING):
+            if best is None or lines.chi2 + walked <= least * (1.0 + ROUNDING) + (
+                BESIDE if lines.passages else ROUNDING
+            ):
                 break
             x, walked = 0.5 * (x + best[0]), 0.5 * (walked + best[1])
             lines = lines_at(x)
