@@ -64,13 +64,18 @@ class GateSettings(Section):
 
 
 class DriftOptions(Section):
-    """The sequential test for drift."""
+    """The two tests for drift: of the windows one by one, and of net changes over a week to four years."""
 
-    false_alarms_a_year: Annotated[
-        float, Field(gt=0, le=100, description="per sensor, for its 12 parameters together")
-    ] = 0.1
+    false_alarms_a_year: Annotated[float, Field(gt=0, le=100, description="per sensor, of all its tests together")] = (
+        0.1
+    )
     windows_a_year: Annotated[float | None, Field(gt=0, description="left out: counted from the windows")] = None
+
+    @property
+    def of_one_test(self) -> float:
+        """False alarms a year of each of the two tests."""
+        return self.false_alarms_a_year / 2.0
 
     def settings(self) -> DriftSettings:
         """The settings for calib.estimate.drift.DriftTest."""
-        return DriftSettings(self.false_alarms_a_year, self.windows_a_year)
+        return DriftSettings(self.of_one_test, self.windows_a_year)

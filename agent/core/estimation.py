@@ -24,7 +24,8 @@ from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.sources import Sources
 from calib.estimate.state import State
 from calib.estimate.statements import Step
-from calib.model import Calibration, Window, WindowSums
+from calib.estimate.walks import Walks
+from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums
 from calib.signal.response import Response
 
 DAY_S = 86400.0
@@ -100,7 +101,7 @@ class Estimation:
         self.in_force, self.law = self.state.result(), self.state.law()
         self.residual_sd = self.state.residual_sd
         self.gate = Gate(channel.gate.filled(self.state.scale, fixed_mount=fixed), self.in_force)
-        self.drift = DriftTest(channel.drift.settings())
+        self.drift, self.walks = DriftTest(channel.drift.settings()), Walks(channel.drift.of_one_test)
         self._held: list[Record] = []
         self._proposed: list[Proposal] = []
         self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
@@ -176,8 +177,7 @@ class Estimation:
         self, window: Window, day: float, lag_s: float, temperature_degc: float, anew: Anew | None = None
     ) -> Judged:
         """Take, hold or refuse one used window. `anew`: the search that found its lag, if there was one."""
-        if (whole := self.state.close_day(day)) is not None:
-            self._tried = None
+        told, whole = self._close_day(day)
         if anew is None:
             tried = self._tried_of(window, day, lag_s, temperature_degc)
         else:
@@ -209,14 +209,15 @@ class Estimation:
             self.state = adopted
             whole = self.state.solve()
             self.drift.restart(innovation.information > 0.0)
+            self.walks.restart()
             decision = replace(decision, reason=f"{decision.reason}{who}")
         kept = held if decision.action == "hold" else self._held
         self._held = kept[-self.gate.held :] if self.gate.held else []
         if self._explain_s is None and self._held:
             self._explain_s = evidence.t_s + self._channel.gate.explain_after_s
-        drift: Sequence[DriftVerdict] = ()
         if decision.action in ("take", "hold"):
-            drift = self.drift.update(day * DAY_S, innovation.score, innovation.information)
+            found = self.drift.update(day * DAY_S, innovation.score, innovation.information)
+            told += [v for v in found if v.verdict != "stable" or v.parameter not in self.walks.drifting]
             if not self.gate.held:  # else it is for windows that agree to confirm it
                 self._follow()
         if decision.in_force:
@@ -230,11 +231,21 @@ class Estimation:
                 self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
             why = self.lag_watch.beyond or most_likely(innovation, self.state.scale)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
-        return Judged(decision, innovation, drift, self._news(earlier) if decision.action in ("take", "adopt") else "")
+        return Judged(decision, innovation, told, self._news(earlier) if decision.action in ("take", "adopt") else "")
 
     def _news(self, earlier: State) -> str:
         """What the newest window, which was taken, has changed besides S and Q."""
         return "; ".join(filter(None, (self.lag_watch.taken(self.state), self.state.settled_since(earlier))))
+
+    def _close_day(self, day: float) -> tuple[list[DriftVerdict], Estimate | None]:
+        """At the first window of a day: net changes of S and Q are judged, and the whole is solved anew. Returns what
+        was found, and the solution."""
+        if not self.state.begins_day(day):
+            return [], None
+        told = self.walks.update(self.state.shown())
+        self.state.widen(self.walks.widened)
+        self._tried = None
+        return told, self.state.close_day(day)
 
     def explain(self, now_s: float) -> str:
         """What explains the held windows, once in each `explain_after_s` while there are any; else "".
@@ -277,7 +288,7 @@ class Estimation:
         """An operator put a proposal in force. The state takes its windows, after the steps that it supposed."""
         if (proposal := self._proposal_of(calibration)) is not None:  # else the state has taken them already
             self.state.take_also(proposal.records, proposal.steps)
-            self.drift.restart(np.ones(12, dtype=bool))
+            self._forget()
         self._put_in_force(calibration)
 
     def roll_back(self, calibration: Calibration, day: float | None = None) -> None:
@@ -291,8 +302,13 @@ class Estimation:
             np.array_equal(now.sensitivity, calibration.sensitivity) and np.array_equal(now.offset, calibration.offset)
         ):
             self.state.put(calibration, day)
-            self.drift.restart(np.ones(12, dtype=bool))
+            self._forget()
         self._put_in_force(calibration)
+
+    def _forget(self) -> None:
+        """S and Q were replaced: what windows told of a drift of them before is none."""
+        self.drift.restart(np.ones(12, dtype=bool))
+        self.walks.restart()
 
     def _put_in_force(self, calibration: Calibration) -> None:
         law = self.state.law()  # the dependence of S and Q on the temperature is that of the state
@@ -309,7 +325,8 @@ class Estimation:
         Held windows of another reference are dropped. Returns whether the calibration in force changed.
         """
         before, follows = self.state.reference, self.follows_state()
-        changed = self.state.meet(reference, calibrated, sensitivity)
+        if changed := self.state.meet(reference, calibrated, sensitivity):
+            self.walks.restart()
         if before not in ("", self.state.reference):
             self.gate.dismiss()
             self.lag_watch.forget()
@@ -335,6 +352,8 @@ class Estimation:
             self.state.remount(of_reference=False)
             self._held = []
         changed = self.state.restate(gravity_mps2) or size is not None
+        if changed or remounted:
+            self.walks.restart()
         return changed and follows and self._update_in_force()
 
     def follows_state(self) -> bool:
@@ -358,7 +377,8 @@ class Estimation:
         """Steps so small that each window alone was consistent, and drifts: the state may follow them.
 
         A drift has made S or Q wrong since its onset. U covers this, and the rate becomes unknown. What looks like a
-        change of S may be another filter, so that the response over frequency is found anew with S.
+        change of S may be another filter, so that the response over frequency is found anew with S, or one of the
+        reference, which may then have changed by as much.
         """
         loose, rate = np.zeros(12), np.zeros(12)
         for k, verdict in enumerate(self.drift.result()):
@@ -369,8 +389,19 @@ class Estimation:
             loose[k] = np.hypot(verdict.change, verdict.u_change)
         if loose.any():
             leaning_rad, another_filter = tilt_rad(loose[9:], self.state.scale), bool(loose[:9].any())
-            self.state.step(self.state.changes(loose, leaning_rad, u_rate=rate, another_filter=another_filter))
+            u = self.state.changes(loose, leaning_rad, u_rate=rate, another_filter=another_filter)
+            self.state.step(u | self._of_reference(loose))
             self.drift.restart(loose > 0.0)
+
+    def _of_reference(self, loose: Array) -> dict[str, float]:
+        """By how much the reference in use may have changed in place of S, by key; nothing if it is stated not to."""
+        found: dict[str, float] = {}
+        if (now := self.state.shown().get(self.state.reference)) is not None:
+            for p in np.flatnonzero(loose[:9]).tolist():
+                for key, (moves, _) in now.makers[p].items():
+                    if key != PARAMETERS[p]:
+                        found[key] = max(found.get(key, 0.0), float(loose[p]) * moves)
+        return found
 
     # --- state
 
@@ -380,6 +411,7 @@ class Estimation:
             "state": self.state.snapshot(),
             "gate": self.gate.snapshot(),
             "drift": self.drift.snapshot(),
+            "walks": self.walks.snapshot(),
             "held": [record.snapshot() for record in self._held],
             "proposed": [proposal.snapshot() for proposal in self._proposed],
             "in_force": fields_of(self.in_force),
@@ -398,6 +430,7 @@ class Estimation:
         self.state.load(state["state"])
         self.gate.load(state["gate"])
         self.drift.load(state["drift"])
+        self.walks.load(state["walks"])
         self._held = [Record.load(record) for record in state["held"]]
         self._proposed = [Proposal.load(proposal) for proposal in state["proposed"]]
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])

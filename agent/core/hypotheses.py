@@ -110,7 +110,7 @@ def _of_either(
         return None
     before, after = state.result(), sensor.state.result()
     moved = np.abs(after.offset - before.offset)
-    significant = moved > SIGNIFICANT * after.standard_uncertainty[9:]
+    significant = moved > SIGNIFICANT * np.sqrt(_covariance_of_change(before, after).diagonal()[9:].clip(0.0))
     leaning = tilt_rad(np.where(significant, moved, 0.0), state.scale)
     found = float(np.abs(after.sensitivity - before.sensitivity).max()) / state.scale
     u = _of_sensor(state, held, leaning, max(1.0, WIDER * found / JUMP_SENSITIVITY))
@@ -124,15 +124,22 @@ def _of_reference(
     """By how much the reference may have stepped, relative, by the key of its drift: it indicates more by the part by
     which S times the direction of a channel is larger."""
     found, change = {}, after.sensitivity - before.sensitivity
+    covariance = _covariance_of_change(before, after)[:9, :9]
     drifts = [quantity for quantity in state.present if quantity.kind is REFERENCE_DRIFT]
     direction = held[0].pose.direction[:, : own_channels(held[0].channels)]
     for quantity, way in zip(drifts, direction.T, strict=False):
         output = before.sensitivity @ way
         by = np.kron(output, way) / (output @ output)  # of the relative step, by the elements of S
-        step, u = float(by @ change.ravel()), float(np.sqrt(by @ after.covariance[:9, :9] @ by))
+        step, u = float(by @ change.ravel()), float(np.sqrt(max(by @ covariance @ by, 0.0)))
         if abs(step) > SIGNIFICANT * u:
             found[quantity.key] = max(stability, abs(step) / SURELY)
     return found
+
+
+def _covariance_of_change(before: Calibration, after: Calibration) -> Array:
+    """(12, 12) that of a free step: what S and Q owe to constant errors, as that of the certificate, is no part of
+    it."""
+    return np.asarray(after.covariance - before.covariance)
 
 
 def _channels(state: State) -> list[Quantity]:

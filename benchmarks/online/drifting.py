@@ -16,7 +16,7 @@ from hw.virtual.building import Building
 
 SEED, RUNS = 60_000, 20  # of each kind
 TIMING = Timing(20.0, 6 * 3600.0, 480)
-PROCESS_PCT = 0.005  # per square-root day, the default: 0.1 % a year
+PROCESS_PCT = 0.005  # per square-root day, as stated: 0.1 % a year
 RATE_PCT = 10.0  # of S_yy a year
 SYY = 4
 BEYOND_U = 3.0

@@ -29,10 +29,10 @@ QUIET = 0.5  # of the threshold: below it a parameter becomes "stable" again
 
 @dataclass(frozen=True, slots=True)
 class DriftSettings:
-    """`false_alarms_a_year`: of all 12 parameters of a sensor together. `windows_a_year`: None means that the number
-    follows from the times of the windows."""
+    """`false_alarms_a_year`: of all 12 parameters of a sensor together, by this test. `windows_a_year`: None means that
+    the number follows from the times of the windows."""
 
-    false_alarms_a_year: float = 0.1
+    false_alarms_a_year: float = 0.05
     windows_a_year: float | None = None
 
 

@@ -18,6 +18,8 @@ MOST_PASSES = 30
 CONVERGED = 1e-6  # standard uncertainties. The passes shrink a step a hundred times, so that the next is 1e-8
 MOST_HALVINGS = 8
 ROUNDING = 1e-9  # of chi-squared: a smaller increase is a rounding error
+# Derivatives at the mean of a walk (calib.estimate.rows) lead to a point that is not exactly the least of chi-squared.
+BESIDE = 1e-3  # of chi-squared by which it may be larger there; halved steps would never arrive
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +67,8 @@ def gauss_newton(
     for passes in range(1, MOST_PASSES + 1):
         lines = lines_at(x)
         for _ in range(MOST_HALVINGS):
-            if best is None or lines.chi2 + walked <= least * (1.0 + ROUNDING) + ROUNDING:
+            larger = lines.chi2 + walked - least * (1.0 + ROUNDING)
+            if best is None or larger <= (BESIDE if lines.passages else ROUNDING):
                 break
             x, walked = 0.5 * (x + best[0]), 0.5 * (walked + best[1])
             lines = lines_at(x)

@@ -175,7 +175,7 @@ SENSITIVITY = Kind(
     "sensitivity",
     source=PRIOR,
     walked_source=WALK,
-    walk=Statement("sensitivity", 5e-5, ("process.sensitivity_pct",), convert=_percent),
+    walk=Statement("sensitivity", 1.8e-4, ("process.sensitivity_pct",), convert=_percent),
     in_output_unit=True,
     loosened_by=("jump",),
 )

@@ -28,8 +28,9 @@ from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
 from calib.estimate.rows import Noise
 from calib.estimate.sources import Sources
-from calib.estimate.statements import DOUBT, Dated, Statements, Step
+from calib.estimate.statements import DOUBT, Dated, Statements, Step, Widening
 from calib.estimate.thinning import thinned
+from calib.estimate.walks import Shown, shown
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array, Calibration, scale_of
 from calib.signal.response import Response
@@ -92,6 +93,7 @@ class State:
         self._records: list[Record] = []
         self._steps: list[Step] = []
         self._dated: list[Dated] = []
+        self._widened: list[Widening] = []
         self._band_hz = band_hz
         self._over = OverFrequency().stating(band_hz)
         self._held_mps2: Array | None = None  # mean input acceleration of a mount that never turned so far
@@ -115,7 +117,7 @@ class State:
         places = {reference: met.place for reference, met in self._met.items()}
         return Statements(
             self._mean, self._u, priors, self._wander, self._temperature, places, certified, tuple(self._steps),
-            tuple(self._dated), self._held_mps2 if self._mean_is_held else None,
+            tuple(self._widened), tuple(self._dated), self._held_mps2 if self._mean_is_held else None,
         )  # fmt: skip
 
     def estimate(self, noise: Noise | None = None, also: Sequence[float] = ()) -> Estimate:
@@ -447,6 +449,15 @@ class State:
         other._records, other._steps, other._dated = list(self._records), list(self._steps), list(self._dated)
         return other
 
+    def shown(self) -> dict[str, Shown]:
+        """S and Q as each present reference shows them; of references with a window."""
+        newest = {r.reference: r for r in self._records if r.reference in self._present}
+        return {reference: shown(self._now, record, fixed=self._fixed) for reference, record in newest.items()}
+
+    def begins_day(self, day: float) -> bool:
+        """Whether a window on this day is the first one of a day of the data."""
+        return self._newest_day is not None and np.floor(day) > self._newest_day
+
     # --- changing
 
     def update(self, record: Record) -> None:
@@ -458,7 +469,7 @@ class State:
     def close_day(self, day: float) -> Estimate | None:
         """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns the
         solution; None where the day is not over."""
-        if self._newest_day is None or np.floor(day) <= self._newest_day:
+        if not self.begins_day(day):
             return None
         self._newest_day = int(np.floor(day))
         cuts = [step.day for step in self._moving_steps]
@@ -471,6 +482,10 @@ class State:
         whole = self.estimate()
         self._now = whole.now
         return whole
+
+    def widen(self, widened: Sequence[Widening]) -> None:
+        """What walks may have added is this from now on; the end of the day solves the whole anew with it."""
+        self._widened = list(widened)
 
     def beyond(self, base: State) -> tuple[list[Record], list[Step]]:
         """The windows and the steps that an earlier state does not have, of which this one is a copy that went on."""
@@ -637,10 +652,9 @@ class State:
         self._used = [dated if of == reference else of for of in self._used]
         self._records = [replace(r, reference=dated) if r.reference == reference else r for r in self._records]
         end = f" of {reference}"
-        self._steps = [
-            replace(step, u={_renamed(key, end, f" of {dated}"): size for key, size in step.u.items()})
-            for step in self._steps
-        ]
+        new = f" of {dated}"
+        self._steps = [replace(own, u={_renamed(k, end, new): u for k, u in own.u.items()}) for own in self._steps]
+        self._widened = [replace(own, u={_renamed(k, end, new): u for k, u in own.u.items()}) for own in self._widened]
         self.solve()
 
     def restate(self, gravity_mps2: tuple[float, float] | None = None) -> bool:
@@ -694,6 +708,7 @@ class State:
         return {
             "records": [record.snapshot() for record in self._records],
             "steps": [asdict(step) for step in self._steps],
+            "widened": [asdict(widening) for widening in self._widened],
             "dated": [{"day": d.day, "mean": d.mean, "covariance": d.covariance} for d in self._dated],
             "present": list(self._present),
             "met": {reference: asdict(met) for reference, met in self._met.items()},
@@ -712,6 +727,7 @@ class State:
         self._place = 0
         self._records = [Record.load(record) for record in state["records"]]
         self._steps = [Step(**step) for step in state["steps"]]
+        self._widened = [Widening(**widening) for widening in state["widened"]]
         self._dated = [Dated(d["day"], np.array(d["mean"]), np.array(d["covariance"])) for d in state["dated"]]
         for place, reference in enumerate(state["present"][: len(self._present)]):
             self._present[place] = reference

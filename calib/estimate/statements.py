@@ -29,6 +29,16 @@ class Step:
     u: Mapping[str, float]
 
 
+@dataclass(frozen=True, slots=True)
+class Widening:
+    """Between two days unknowns may have walked by more than the walks say: standard uncertainties of what they may
+    have walked besides in all of this time, by key (calib.estimate.walks)."""
+
+    since: float
+    until: float
+    u: Mapping[str, float]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Dated:
     """S and Q were `mean` (12,) with this `covariance` (12, 12) on a day, whatever was known of them before."""
@@ -54,6 +64,7 @@ class Statements:
     places: Mapping[str, int] = field(default_factory=dict)
     certified: Mapping[str, float] = field(default_factory=dict)
     steps: Sequence[Step] = ()
+    widened: Sequence[Widening] = ()
     dated: Sequence[Dated] = ()
     held_mps2: Array | None = None
 

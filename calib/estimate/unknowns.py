@@ -23,7 +23,7 @@ from calib.estimate.quantities import (
     offset_temperature,
 )
 from calib.estimate.record import Record
-from calib.estimate.statements import DOUBT, FLAT, Dated, Statements
+from calib.estimate.statements import DOUBT, FLAT, Dated, Statements, Widening
 from calib.estimate.terms import Term, terms
 from calib.model import Array
 
@@ -213,6 +213,7 @@ class Unknowns:
         for step in s.steps:
             if before < step.day <= after:
                 noises += self.stepped(step.u)
+        noises += self.stepped(_widened(s.widened, before, after))
         noise = np.array(noises).reshape(-1, size).T
         back = np.asarray(np.linalg.inv(follows), dtype=np.float64)
         return follows, shift, Passage(back, np.zeros(size), noise)
@@ -292,3 +293,13 @@ class Unknowns:
             if name in self.at:
                 found[row, self.at[name]] = 1.0
         return found
+
+
+def _widened(widened: Sequence[Widening], before: float, after: float) -> dict[str, float]:
+    """The standard uncertainties, by key, of what widened walks may add from one day to another."""
+    variance: dict[str, float] = {}
+    for own in widened:
+        if (share := (min(after, own.until) - max(before, own.since)) / (own.until - own.since)) > 0.0:
+            for key, u in own.u.items():
+                variance[key] = variance.get(key, 0.0) + share * u**2
+    return {key: float(np.sqrt(value)) for key, value in variance.items()}

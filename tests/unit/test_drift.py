@@ -75,7 +75,7 @@ def test_the_pace_of_the_windows_sets_the_threshold() -> None:
     stated, minutes = DriftTest(HOURLY), DriftTest(DriftSettings(windows_a_year=8766.0 * 60))
     assert seen.threshold() == pytest.approx(stated.threshold(), abs=0.02)
     assert np.log(60) < minutes.threshold() - stated.threshold() < np.log(60) + 0.5
-    rate = 0.1 / (12 * 8766.0)
+    rate = 0.05 / (12 * 8766.0)
     assert stated.threshold() == pytest.approx(false_alarm_threshold(rate, FEWEST, SPAN), abs=1e-12)
 
 

@@ -76,7 +76,8 @@ def test_a_jump_needs_as_many_windows_that_agree_as_the_configuration_says() -> 
 
 def test_a_step_too_small_for_any_window_alone_is_followed() -> None:
     random = np.random.default_rng(2)
-    found = settled(random, process={"sensitivity_pct": 0.0}, gate={"false_holds": 1e-9})
+    process, exact = {"sensitivity_pct": 0.0}, {"stability_pct": 0.0}
+    found = settled(random, process=process, certificate=exact, gate={"false_holds": 1e-9})
     quiet = {"level_mps2": (0.0, 0.01, 0.0)}  # one tells S_yy to 1 %, the state knows it to 0.1 %
     judged = hours(found, [building_window(random, S=OF_Y, **quiet) for _ in range(60)], first=10)
     assert set(actions(judged)) == {"take"}

@@ -127,4 +127,4 @@ def test_the_state_is_plain_and_comes_back_bit_for_bit() -> None:
 
 def test_drift_options_reach_the_test() -> None:
     assert DriftOptions().settings() == DriftSettings()
-    assert DriftOptions(false_alarms_a_year=1, windows_a_year=10).settings() == DriftSettings(1, 10)
+    assert DriftOptions(false_alarms_a_year=1, windows_a_year=10).settings() == DriftSettings(0.5, 10)
