@@ -73,7 +73,9 @@ def told(
     slopes = record.root @ np.vstack([(truth.S @ D).T, on_rate.T]) + slope_noise
     size = float(np.linalg.norm(pose.gravity_mps2))
     gravity = _turn(truth.turn_gravity_rad) @ pose.gravity_mps2 * (1.0 + truth.gravity_mps2 / (size or 1.0))
-    means = (truth.S @ gravity + truth.Q + mean_noise)[None]
+    mean_u, mean_rate = np.split(record.mean_x, 2)
+    moving = truth.S @ D @ mean_u - truth.lag_s * (truth.S @ D @ mean_rate)
+    means = (truth.S @ gravity + moving + truth.Q + mean_noise)[None]
     return replace(
         record, day=day, days=(day, day), slopes=slopes, means=means, reference=reference, temperature_degc=degc,
         over_t=np.array([[1.0, degc, degc**2]]),

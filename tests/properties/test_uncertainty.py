@@ -192,9 +192,9 @@ def q_drifts(draw: Drawn) -> World:
     u = 0.01, 0.5
     S, Q = s_and_q(draw, u)
     rate = SCALE * 1e-3 * draw("rate")
-    records = [told(BESIDE, Truth(S, Q), 0.0)]
+    records = [told(BESIDE, Truth(S, Q), 30.0)]
     walks, now = {"offset_rate_mps2": 1e-3}, values(S, Q + 100.0 * rate)
-    return World("rate", each(*OFFSET), records, now, u, {}, walks, until=100.0)
+    return World("rate", each(*OFFSET), records, now, u, {}, walks, until=130.0)
 
 
 @case
@@ -352,6 +352,16 @@ def the_lags_of_the_axes(draw: Drawn) -> World:
     record = told(LEVEL, Truth(S, Q, lag_s=lag + axes), 0.0)
     now = values(S, Q) | {"lag of A": float(lag[0])}
     return World("axes", each("lag of A"), [record], now, u, {"lag_s": 2e-3, "lag_axis_s": 1e-4})
+
+
+@case
+def the_mean_of_motion_that_is_late(draw: Drawn) -> World:
+    """The slopes tell the lag: so the mean of du/dt, which moves the output by the lag, makes no error."""
+    u, own = (1e-4, 5.0), replace(BESIDE, mean_x=np.array([0.1, -0.2, 0.3, 2.0, -1.0, 3.0]))
+    S, Q = s_and_q(draw, u)
+    late = np.repeat(2e-4 * draw("lag", 1), 3)
+    record = told(own, Truth(S, Q, lag_s=late), 0.0, mean_noise=SCALE * 1e-3 * draw("offset"))
+    return World("offset", each(*OFFSET), [record], values(S, Q), u, {"lag_s": 2e-4, "offset_mps2": 1e-3})
 
 
 # --- the pose
@@ -609,6 +619,23 @@ def noise_of_means_that_were_merged(draw: Drawn) -> World:
     noise = draw("noise", 9).reshape(3, 3) / np.sqrt(BESIDE.count)
     records = [told(one, Truth(S, Q), 0.0, mean_noise=one.noise * more) for one, more in zip(own, noise, strict=True)]
     return World("noise", each(*OFFSET), [merged(records, S0)], values(S, Q), u)
+
+
+@case
+def a_walk_within_windows_that_were_merged(draw: Drawn) -> World:
+    """Their mean differs from S and Q in the middle of their time, to which they are ascribed."""
+    u, count = (0.5, 50.0), 40
+    S, Q = s_and_q(draw, u)
+    steps = draw("walk", 2 * count).reshape(2, count) * np.array([[1e-4], [0.1]]) * SCALE * np.sqrt(10.0 / (count - 1))
+    steps[:, [0, -1]] *= np.sqrt(0.5)  # from the middle to the windows on both sides
+    half = count // 2
+    path = np.hstack([np.cumsum(steps[:, :half], axis=1)[:, ::-1], np.cumsum(steps[:, half:][:, ::-1], axis=1)])
+    records = []
+    for k, (of_S, of_Q) in enumerate(path.T):
+        truth = Truth(S + np.diag([0.0, of_S, 0.0]), Q + np.array([0.0, 0.0, of_Q]))
+        records.append(told(BESIDE, truth, 10.0 * k / (count - 1)))
+    walks = {"sensitivity": 1e-4, "offset_mps2": 0.1}
+    return World("walk", each("Syy", "Qz"), [merged(records, S0)], values(S, Q), u, {}, walks)
 
 
 @case
