@@ -66,7 +66,7 @@ class Unknowns:
     def __init__(self, statements: Statements, records: Sequence[Record]) -> None:
         self._begin(statements, records)
         self._add(self._of_sensor())
-        for record in records:
+        for record in sorted(records, key=lambda r: r.days[0]):  # merged ones overlap
             self.meet(record)
 
     def _begin(self, statements: Statements, records: Sequence[Record]) -> None:

@@ -639,6 +639,33 @@ def a_walk_within_windows_that_were_merged(draw: Drawn) -> World:
 
 
 @case
+def a_reference_that_drifts_within_windows_that_were_merged(draw: Drawn) -> World:
+    """S is known, so that they tell the drift in the middle of their time, but for what it walked before and after."""
+    u, count, days = (1e-6, 0.01), 40, 100.0
+    S, Q = s_and_q(draw, u)
+    steps = draw("walk", 2 * count).reshape(2, count) * 0.005 * np.sqrt(days / 365.25 / (count - 1))
+    steps[:, [0, -1]] *= np.sqrt(0.5)
+    half = count // 2
+    path = np.hstack([np.cumsum(steps[:, :half], axis=1)[:, ::-1], np.cumsum(steps[:, half:][:, ::-1], axis=1)])
+    own = [told(LEVEL, Truth(S, Q, reference=np.append(w, 0.0)), days * k / (count - 1)) for k, w in enumerate(path.T)]
+    first = told(replace(LEVEL, root=0.0 * LEVEL.root), Truth(S, Q), -10000.0)
+    now = {"reference_drift_x of A": 0.0, "reference_drift_y of A": 0.0}
+    return World("walk", each(*now), [first, merged(own, S0)], values(S, Q) | now, u, {"reference_drift": 0.005})
+
+
+@case
+def a_reference_that_drifts_from_the_first_of_windows_that_were_merged(draw: Drawn) -> World:
+    """S is not known: it owes to the drift until the middle of their time, and nothing of it is known beforehand."""
+    u, days = (0.5, 0.01), 100.0
+    S, Q = s_and_q(draw, u)
+    drifted = 0.005 * np.sqrt(0.5 * days / 365.25) * draw("drift")
+    walk = 0.005 * np.sqrt(days / 12.0 / 365.25) * draw("within")
+    record = told(LEVEL, Truth(S, Q, reference=drifted + walk), 0.5 * days)
+    record = replace(record, days=(0.0, days), windows=40)
+    return World("drift", each(*MAIN), [record], values(S, Q), u, {"reference_drift": 0.005})
+
+
+@case
 def the_lag_of_each_window(draw: Drawn) -> World:
     """The two clocks tell it to 0.1 ms, as stated, in the first window, and to 0.3 ms in the second."""
     u = 0.1, 0.01
