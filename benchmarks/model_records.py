@@ -17,6 +17,7 @@ from calib.estimate.statements import Statements
 from calib.estimate.unknowns import Unknowns
 from calib.model import Array
 from tests.building_windows import building_window
+from tests.drawn_records import scatter
 
 LAG_LEFT_S = 2e-5  # what a front end leaves of the lag
 
@@ -26,7 +27,7 @@ def templates(count: int, seed: int = 1) -> list[Record]:
     random = np.random.default_rng(seed)
     levels = np.exp(random.uniform(np.log(0.02), np.log(0.3), size=(count, 3)))
     made = (building_window(random, level_mps2=tuple(level)) for level in levels)
-    return [replace(Record.of(window, 0.0), freedom=60.0, ratio=np.ones(2)) for window in made]
+    return [replace(Record.of(window, 0.0), scores=scatter(1.0, 60.0)) for window in made]
 
 
 def drawn(

@@ -20,9 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.core.snapshot import pack
 from benchmarks.model_records import drawn, templates
-from benchmarks.page import PAGE, machine, write_part
+from benchmarks.page import machine, write_part
 from calib.estimate.estimate import Estimate, estimate
 from calib.estimate.nuisances import Priors
 from calib.estimate.record import Record
@@ -32,6 +31,7 @@ from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
 from tests.clamp_windows import G_MPS2
 
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 YEARS, YEAR_DAYS, EVERY_DAYS, MERGED_DAYS = 10, 365.0, 2.0, 10.0
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.02, 0.01), np.full(3, 0.5))
@@ -115,8 +115,28 @@ def _past(whole: Estimate, few: Estimate, truth: Array) -> tuple[float, float]:
     return tuple(float(np.sqrt(np.mean((moved[far] / u[far]) ** 2))) for moved in (found - same, found - true))  # type: ignore[return-value]
 
 
-if __name__ == "__main__":
+def table() -> str:
+    """A row for each year's end."""
+    rows = [
+        "| walks | year | windows, records | largest difference of S and Q / u | U / U of all "
+        "| past: rms of difference / u, of error / u | s of CPU, all and merged |",
+        "| --- " * 7 + "|",
+    ]
     for name, walks in WALKS.items():
         for seed in SEEDS:
-            for k, c in enumerate(years(walks, seed)):
-                print(name, seed, k, c, flush=True)
+            for k, c in enumerate(years(walks, seed), start=1):
+                rows.append(
+                    f"| {name} | {k} | {c.windows}, {c.records} | {c.worst:.2f} | {c.ratio[0]:.3f} to {c.ratio[1]:.3f} "
+                    f"| {c.past:.2f}, {c.errors:.2f} | {c.seconds[0]:.1f}, {c.seconds[1]:.1f} |"
+                )
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true")
+    text = f"`python -m benchmarks.ten_years`, {machine()}.\n\n{table()}"
+    if parser.parse_args().write:
+        write_part("ten years", text, PAGE)
+    else:
+        print(text)

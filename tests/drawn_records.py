@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.estimate.record import Record
+from calib.estimate.type_a import LEVELS, SUMS
 from calib.model import Pose, Window
 from hw.virtual.schedule import rotation
 from tests.clamp_windows import G_MPS2, sums_of
@@ -53,8 +54,15 @@ def template(
             du[:, k] += level_mps2[k] * omega * np.cos(omega * t + phase)
     V = u @ pose.direction.T + pose.gravity_mps2 + noise * random.normal(size=(len(t), 3))
     window = Window(0.0, SECONDS, pose, sums_of(u - u.mean(axis=0), du, V, 20), True, "", len(t), 0)
-    white = {"noise": np.full(3, noise), "ratio": np.ones(2), "freedom": 1e4, "mean_x": np.zeros(2 * m)}
+    white = {"noise": np.full(3, noise), "scores": scatter(1.0, 1e4), "mean_x": np.zeros(2 * m)}
     return replace(Record.of(window, 0.0), **white, held_mps2=pose.gravity_mps2)  # type: ignore[arg-type]
+
+
+def scatter(ratio: float, freedom: float) -> np.ndarray:
+    """The sums of a window whose slopes and means scatter so many times more than white noise makes them."""
+    found = np.zeros((2, LEVELS, SUMS))
+    found[:, 0, :5] = freedom, 1.0, freedom + 1.0, 1.0, ratio * freedom
+    return found
 
 
 def told(

@@ -15,7 +15,7 @@ from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
 from calib.estimate.unknowns import Unknowns
-from calib.model import Array
+from calib.model import Array, own_channels
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +236,8 @@ def _by_channel(windows: Windows) -> Array:
     """(W, 2M, 3, C) derivatives of the slopes, whitened by the noise, by the size of each channel of the reference."""
     own, m = windows.stack, windows.channels
     b = (np.linalg.pinv(own.root, rcond=1e-9) @ own.slopes)[:, :m] / own.noise[:, None]
-    channels = windows.channel == np.unique(windows.channel)[:, None]
-    return np.asarray(np.einsum("wrm,cm,wmi->wric", own.root[..., :m], channels, b))
+    channels = np.resize(np.eye(own_channels(m)), (m, own_channels(m)))  # integrals have the size of their own channel
+    return np.asarray(np.einsum("wrm,mc,wmi->wric", own.root[..., :m], channels, b))
 
 
 class _Means:

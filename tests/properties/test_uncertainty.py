@@ -23,7 +23,7 @@ from calib.estimate.thinning import merged
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Array, Pose
 from tests.clamp_windows import G_MPS2, frame
-from tests.drawn_records import UP, Truth, template, told
+from tests.drawn_records import UP, Truth, scatter, template, told
 
 NEAR = 0.03  # of the mean of z^2: squares of what is drawn, and 1e-3 of the variance that the noise makes
 SHARE = 0.8
@@ -549,9 +549,9 @@ def a_temperature_that_nobody_told(draw: Drawn) -> World:
 # --- what belongs to a window alone
 
 
-def noisy(ratio: float = 1.0) -> Record:
+def noisy(ratio: float = 1.0, freedom: float = 1e4) -> Record:
     """Its white noise makes 2 % of S, and its residuals scatter so many times more than white ones."""
-    return replace(LEVEL, noise=np.full(3, 0.02 * SCALE * abs(LEVEL.root[0, 0])), ratio=np.full(2, ratio))
+    return replace(LEVEL, noise=np.full(3, 0.02 * SCALE * abs(LEVEL.root[0, 0])), scores=scatter(ratio, freedom))
 
 
 @case
@@ -568,7 +568,7 @@ def noise_of_the_slopes_pooled_over_windows(draw: Drawn) -> World:
     """The second window has three times the degrees of freedom of the first: together their ratio is 2.5."""
     u = 0.5, 0.01
     S, Q = s_and_q(draw, u)
-    own = [replace(noisy(ratio), freedom=freedom) for ratio, freedom in ((1.0, 30.0), (3.0, 90.0))]
+    own = [noisy(1.0, 30.0), noisy(3.0, 90.0)]
     noise = draw("noise", 36).reshape(2, 6, 3) * own[0].noise * np.sqrt(2.5)
     records = [told(one, Truth(S, Q), 0.0, slope_noise=each_noise) for one, each_noise in zip(own, noise, strict=True)]
     return World("noise", each(*PARAMETERS[:9]), records, values(S, Q), u)
@@ -576,7 +576,7 @@ def noise_of_the_slopes_pooled_over_windows(draw: Drawn) -> World:
 
 @case
 def noise_of_the_mean(draw: Drawn) -> World:
-    u, own = (1e-4, 50.0), replace(BESIDE, noise=np.array([1.0, 2.0, 3.0]), ratio=np.full(2, 3.0), independent=0.5)
+    u, own = (1e-4, 50.0), replace(BESIDE, noise=np.array([1.0, 2.0, 3.0]), scores=scatter(3.0, 1e4), independent=0.5)
     S, Q = s_and_q(draw, u)
     errors = own.noise * np.sqrt(6.0 / own.count) * draw("noise")
     return World("noise", each(*OFFSET), [told(own, Truth(S, Q), 0.0, mean_noise=errors)], values(S, Q), u)
