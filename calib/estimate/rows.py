@@ -204,7 +204,9 @@ class _Slopes:
         walks = np.sqrt(unknowns.a_day[[0, 4, 8]])
         self._walked = windows.moved[:, :, None, :] * walks[:, None] / own.noise[:, None, :, None]
         drifted = np.sqrt(self._stretch / YEAR_DAYS) * [p.of(REFERENCE_DRIFT.prior) for p in priors]
-        self._drifted = _by_channel(windows).reshape(len(records), n, -1) * drifted[:, None, None]
+        self._drifted = (
+            _by_channel(windows).reshape(len(records), n, own_channels(windows.channels)) * drifted[:, None, None]
+        )
         self._noise = np.tile(own.noise, n // 3)
         self.weights = self._inverse() / self._noise[:, None] if n else np.zeros((len(records), 0, 0))
 
