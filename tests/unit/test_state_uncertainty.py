@@ -10,6 +10,7 @@ import pytest
 
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
+from calib.estimate.over_frequency import OverFrequency
 from calib.estimate.record import Record
 from calib.estimate.rows import Degrees, Noise, Rows
 from calib.estimate.state import State
@@ -147,3 +148,13 @@ def test_a_dated_calibration_counts_once() -> None:
     now = estimate([], stated).now
     np.testing.assert_allclose(now.mean[:12], MEAN + U, rtol=1e-9)
     np.testing.assert_allclose(now.variance[:12], 0.5 * U**2, rtol=1e-9)
+
+
+def test_what_known_filters_leave_open_is_in_the_uncertainty_of_s() -> None:
+    """1 % of each element, common to all of them."""
+    priors = Priors.none().with_values({"known_u": 0.01, "reference_frequency_hz": 2.0})
+    now = estimate([record()], Statements(MEAN, U, {"": priors}, Wander(STILL), TemperatureModel())).now
+    more = OverFrequency().factor(now, "A", priors)[:12]
+    grown = more @ more.T - now.factor[:12] @ now.factor[:12].T
+    open_ = np.append(0.01 * S.ravel(), np.zeros(3))
+    np.testing.assert_allclose(grown, np.outer(open_, open_), rtol=1e-4, atol=1e-9)
