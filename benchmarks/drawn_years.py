@@ -17,7 +17,7 @@ import argparse
 
 import numpy as np
 
-from benchmarks.model_records import drawn, templates
+from benchmarks.model_records import drawn, smoothed, templates
 from benchmarks.page import machine, write_part
 from benchmarks.ten_years import MEAN, PAGE, U, degc
 from calib.estimate.estimate import estimate
@@ -47,8 +47,8 @@ def year(seed: int) -> tuple[Array, Array, Array, Array]:
     across the gap (12,) by the past and by the filter."""
     random, statements = np.random.default_rng(seed), stated()
     records, truth = drawn(random, templates(40), DAYS, statements, temperature=degc)
-    days, values, covariance = estimate(records, statements).past()
-    z = (values - truth) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    days, values, u = smoothed(estimate(records, statements))
+    z = (values - truth) / u
     before, after = int(np.searchsorted(days, GAP[0])), int(np.searchsorted(days, GAP[1]))
     moved = truth[after] - truth[before]
     early = estimate(records[: before + 1], statements).now.mean[:12]

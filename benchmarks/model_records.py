@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.estimate.physics import Windows
+from calib.estimate.estimate import Estimate
+from calib.estimate.physics import Stack, Windows
 from calib.estimate.record import Record
 from calib.estimate.statements import Statements
 from calib.estimate.unknowns import Unknowns
@@ -65,8 +66,9 @@ def drawn(
 
 def _told(random: np.random.Generator, record: Record, unknowns: Unknowns, x: Array) -> Record:
     s, priors = unknowns.statements, unknowns.statements.of(record.reference)
-    told = priors.reference_frequency_hz, priors.reference_share, priors.known_size
-    windows = Windows([record], s.temperature.reference_degc, s.mount, *told)
+    told = {"share": priors.reference_share, "known_size": priors.known_size}
+    stack, degc = Stack.of([record], fixed=s.held_mps2 is not None), s.temperature.reference_degc
+    windows = Windows(stack, degc, s.nominal, s.held_mps2, at_hz=priors.reference_frequency_hz, **told)
     effect, taken_out = unknowns.effect(record, record.day)
     slopes, means = windows.predicted((effect @ (x - taken_out))[None])
     white = np.sqrt(1.0 / record.independent)
@@ -77,3 +79,12 @@ def _told(random: np.random.Generator, record: Record, unknowns: Unknowns, x: Ar
     slopes = slopes + late * record.loadings[0].reshape(-1, 3) * record.noise
     scatter = np.hypot(white * record.noise / np.sqrt(record.count), priors.offset_mps2 * s.scale)
     return replace(record, slopes=slopes, means=means[0] + scatter * random.standard_normal((1, 3)))
+
+
+def smoothed(found: Estimate) -> tuple[Array, Array, Array]:
+    """Days (K,) of the epochs with a window, S and Q (K, 12) by all windows, and their standard uncertainties."""
+    seen = set(found.epoch_of.tolist())
+    past = [own for k, own in enumerate(list(found.past())[::-1]) if k in seen]
+    days = np.array([own.now.day for own in past])
+    values, variance = (np.array([getattr(own.now, name)[:12] for own in past]) for name in ("mean", "variance"))
+    return days, values, np.sqrt(variance)

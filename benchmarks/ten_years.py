@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.model_records import drawn, templates
+from benchmarks.model_records import drawn, smoothed, templates
 from benchmarks.page import machine, write_part
 from calib.estimate.estimate import Estimate, estimate
 from calib.estimate.nuisances import Priors
@@ -106,9 +106,8 @@ def compared(every: Sequence[Record], merged: Sequence[Record], statements: Stat
 
 def _past(whole: Estimate, few: Estimate, truth: Array) -> tuple[float, float]:
     """The difference of both pasts and the error of that of the merged records, as rms over u, on the days of those."""
-    days, values, _ = whole.past()
-    at, found, covariance = few.past()
-    u = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    days, values, _ = smoothed(whole)
+    at, found, u = smoothed(few)
     same = np.array([np.interp(at, days, values[:, k]) for k in range(12)]).T
     true = np.array([np.interp(at, days, truth[: len(days), k]) for k in range(12)]).T
     far = ~np.any([np.abs(at - step.day) < 20.0 for step in STEPS], axis=0)  # between windows on both sides of a step
