@@ -311,7 +311,9 @@ def estimate(
     """
     records = together(sorted(records, key=lambda r: r.day), fixed=statements.held_mps2 is not None)
     unknowns = Unknowns(statements, records)
-    days = distinct(np.array([*(r.day for r in records), *(d.day for d in statements.dated), *also], dtype=np.float64))
+    stated = [d.day for d in statements.dated] + unknowns.rates_begin
+    stated += [unknowns.begin] if records else []  # before the middle of the first record, if windows were merged
+    days = distinct(np.array([*(r.day for r in records), *stated, *also], dtype=np.float64))
     if not len(days):
         days = np.array([unknowns.begin])
     solution = _Solution(unknowns, records, days, noise or Noise.of(records), _seen(records))

@@ -10,12 +10,12 @@ import numpy as np
 
 from calib.estimate import physics
 from calib.estimate.physics import Stack, Windows
-from calib.estimate.quantities import TEMPERATURE, WALK, offset_temperature
+from calib.estimate.quantities import REFERENCE_DRIFT, TEMPERATURE, WALK, YEAR_DAYS, offset_temperature
 from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
 from calib.estimate.unknowns import Unknowns
-from calib.model import Array
+from calib.model import Array, own_channels
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +203,10 @@ class _Slopes:
         self._missed = (np.sqrt(silent**2 @ unknown.T**2) / own.noise[:, None]).reshape(len(records), n)
         walks = np.sqrt(unknowns.a_day[[0, 4, 8]])
         self._walked = windows.moved[:, :, None, :] * walks[:, None] / own.noise[:, None, :, None]
+        drifted = np.sqrt(self._stretch / YEAR_DAYS) * [p.of(REFERENCE_DRIFT.prior) for p in priors]
+        self._drifted = (
+            _by_channel(windows).reshape(len(records), n, own_channels(windows.channels)) * drifted[:, None, None]
+        )
         self._noise = np.tile(own.noise, n // 3)
         self.weights = self._inverse() / self._noise[:, None] if n else np.zeros((len(records), 0, 0))
 
@@ -215,6 +219,7 @@ class _Slopes:
             for i in range(3):
                 each = self._walked[:, :, i]
                 covariance[:, i::3, i::3] += self._stretch[:, None, None] * (each @ each.mT)
+            covariance = covariance + self._drifted @ self._drifted.mT
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
     def shares(self, gains: Array) -> dict[str, Array]:
@@ -225,8 +230,16 @@ class _Slopes:
         return {
             TYPE_A: np.einsum("w,wrm->m", self._white, moved**2), LAGS: by_load[:, 0].sum(axis=0),
             CORRECTION: by_load[:, 1].sum(axis=0), UNSEEN: ((self._missed[..., None] * moved) ** 2).sum(axis=(0, 1)),
-            WALK: self._stretch @ by_walk,
+            WALK: self._stretch @ by_walk, REFERENCE_DRIFT.source: ((self._drifted.mT @ moved) ** 2).sum(axis=(0, 1)),
         }  # fmt: skip
+
+
+def _by_channel(windows: Windows) -> Array:
+    """(W, 2M, 3, C) derivatives of the slopes, whitened by the noise, by the size of each channel of the reference."""
+    own, m = windows.stack, windows.channels
+    b = (np.linalg.pinv(own.root, rcond=1e-9) @ own.slopes)[:, :m] / own.noise[:, None]
+    channels = np.resize(np.eye(own_channels(m)), (m, own_channels(m)))  # integrals have the size of their own channel
+    return np.asarray(np.einsum("wrm,mc,wmi->wric", own.root[..., :m], channels, b))
 
 
 class _Means:

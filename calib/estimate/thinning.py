@@ -20,7 +20,10 @@ from calib.model import Array
 
 NEWEST = 48  # records that stay as they are: four times round twelve positions
 # (age in days from which on, width in days): an hour for two weeks, then longer ones.
-WIDTHS = ((0.0, 1.0 / 24.0), (14.0, 1.0), (60.0, 7.0), (400.0, 30.0), (1200.0, 365.0))
+WIDTHS = ((0.0, 1.0 / 24.0), (14.0, 1.0), (60.0, 7.0), (400.0, 14.0), (1200.0, 30.0))
+MOST = 650  # records: 2 MB with three axes of a reference. Of many positions and references the widths are doubled
+WIDEST = 4096.0  # times the widths
+BRIEF_DAYS = 1.0  # so long Q is the same at all temperatures of a record
 BIN_K = 10.0  # records whose temperatures differ by more stay apart: S may depend on it
 
 
@@ -31,16 +34,25 @@ def thinned(records: Sequence[Record], now: float, nominal: Array, cuts: Sequenc
     """
     records = sorted(records, key=lambda r: r.day)
     old, new = records[:-NEWEST], records[-NEWEST:]
-    buckets: dict[tuple[object, ...], list[Record]] = {}
-    for r in old:
-        width = max(width for age, width in WIDTHS if now - r.day >= age or age == 0.0)
+    wider, buckets = 1.0, _buckets(old, now, cuts, 1.0)
+    while len(buckets) + len(new) > MOST and wider < WIDEST:
+        wider *= 2.0
+        buckets = _buckets(old, now, cuts, wider)
+    return sorted((merged(own, nominal) for own in buckets), key=lambda r: r.day) + new
+
+
+def _buckets(records: Sequence[Record], now: float, cuts: Sequence[float], wider: float) -> list[list[Record]]:
+    """The records that become one each, with so many times the widths."""
+    found: dict[tuple[object, ...], list[Record]] = {}
+    for r in records:
+        width = wider * max(width for age, width in WIDTHS if now - r.day >= age or age == 0.0)
         degc = np.floor(r.temperature_degc / BIN_K) if np.isfinite(r.temperature_degc) else None
         key = (
             width, int(r.day // width), sum(r.day >= day for day in cuts), r.setting, r.excited.tobytes(), r.response,
             degc, r.motion_hz is None, r.planar,
         )  # fmt: skip
-        buckets.setdefault(key, []).append(r)
-    return sorted((merged(own, nominal) for own in buckets.values()), key=lambda r: r.day) + new
+        found.setdefault(key, []).append(r)
+    return list(found.values())
 
 
 def merged(records: Sequence[Record], nominal: Array) -> Record:
@@ -60,7 +72,10 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
     D = first.pose.direction
     # The means of V at one mean of the reference: its own motion moves them by S as nearly as nominal.
     moved = [r.means - np.outer(r.over_t[:, 0], nominal @ D @ (r.mean_x - mean_x)[: D.shape[1]]) for r in records]
-    over = _triangle(np.hstack([np.vstack([r.over_t for r in records]), np.vstack(moved)]), 3)
+    days = min(r.days[0] for r in records), max(r.days[1] for r in records)
+    # Over weeks Q drifts with the seasons, and the temperature within them would take it up: the mean alone is kept.
+    rows = 3 if days[1] - days[0] <= BRIEF_DAYS else 1
+    over = _triangle(np.hstack([np.vstack([r.over_t for r in records]), np.vstack(moved)]), rows)
     power = np.array([(r.root[:, : r.channels] ** 2).sum() for r in records]) + np.finfo(float).tiny
     deviations, left_open = Deviations(), LeftOpen()
     motions = [r.motion for r in records if r.motion is not None]
@@ -69,7 +84,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
     return replace(
         first,
         day=float(share @ [r.day for r in records]),
-        days=(min(r.days[0] for r in records), max(r.days[1] for r in records)), windows=int(windows.sum()),
+        days=days, windows=int(windows.sum()),
         u_lag_s=_rms(share, [r.u_lag_s for r in records]), attenuation=_rms(share, [r.attenuation for r in records]),
         independent=float(share @ [r.independent for r in records]), along=mean("along"),
         along_rate_s=mean("along_rate_s"), root=root, slopes=slopes, passed=passed,

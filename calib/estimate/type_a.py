@@ -200,7 +200,7 @@ def _paired(scores: Array) -> Array:
     if scores.shape[1] < 2:
         return scores
     even = scores[:, : scores.shape[1] // 2 * 2]
-    pairs = np.asarray(even.reshape(len(even), -1, 2, even.shape[2]).sum(2))
+    pairs = np.asarray(even.reshape(len(even), even.shape[1] // 2, 2, even.shape[2]).sum(2))
     if even.shape[1] < scores.shape[1]:
         pairs[:, -1] += scores[:, -1]
     return pairs

@@ -66,7 +66,7 @@ class Unknowns:
     def __init__(self, statements: Statements, records: Sequence[Record]) -> None:
         self._begin(statements, records)
         self._add(self._of_sensor())
-        for record in records:
+        for record in sorted(records, key=lambda r: r.days[0]):  # merged ones overlap
             self.meet(record)
 
     def _begin(self, statements: Statements, records: Sequence[Record]) -> None:
@@ -179,6 +179,12 @@ class Unknowns:
         return np.array([unknown.a_day for unknown in self.all[:12]])
 
     @property
+    def rates_begin(self) -> list[float]:
+        """Days after the first window at which S or Q may have begun to drift: an epoch begins there."""
+        begun = (step.day for step in self.statements.steps if not set(ALL_RATES).isdisjoint(step.u))
+        return [day for day in begun if day > self.begin]
+
+    @property
     def prior(self) -> tuple[Array, Array]:
         """Means and standard uncertainties (N,) before any data; with the steps of before the first window."""
         u = np.array([unknown.u for unknown in self.all])
@@ -192,7 +198,7 @@ class Unknowns:
     def passage(self, before: float, after: float) -> tuple[Array, Array, Passage]:
         """From one day to another: F (N, N), f (N,) of x' = F x + f, and the passage with the gap 0."""
         size, s, days = len(self.all), self.statements, max(after - before, 0.0)
-        follows, shift, noises = np.eye(size), np.zeros(size), []
+        follows, shift, walks = np.eye(size), np.zeros(size), dict[int, Array]()
         for k, own in enumerate(self.all):
             if own.a_day == 0.0:
                 continue
@@ -204,12 +210,18 @@ class Unknowns:
                 else:
                     shift[k] = (1.0 - kept) * own.mean
             if variance > 0.0:
-                noises.append(np.sqrt(variance) * np.eye(size)[k])
+                walks[k] = np.sqrt(variance) * np.eye(size)[k]
         for quantity, name in zip(S_AND_Q, ALL_RATES, strict=True):
-            if (rate := self.at.get(name)) is not None:
-                follows[self.at[quantity.key], rate] += days
-                if (centre := self._centre(quantity)) is not None:
-                    follows[centre, rate] += days
+            if (rate := self.at.get(name)) is None:
+                continue
+            k, centre = self.at[quantity.key], self._centre(quantity)
+            moved = [k] if centre is None else [k, centre]
+            follows[moved, rate] += 0.5 * days * (1.0 + follows[rate, rate])
+            if (walk := walks.get(rate)) is not None:  # the mean of a random walk: half of its end, and a bridge
+                bridge = days / np.sqrt(12.0) * walk[rate] * np.eye(size)[k]
+                walk[moved] = 0.5 * days * walk[rate]
+                walks[k] = np.hypot(walks.get(k, np.zeros(size)), bridge)
+        noises = list(walks.values())
         for step in s.steps:
             if before < step.day <= after:
                 noises += self.stepped(step.u)

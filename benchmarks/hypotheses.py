@@ -1,0 +1,110 @@
+"""Which device has changed? Two references beside one sensor at the level of records; steps of one device.
+
+    python -m benchmarks.hypotheses [--seeds 20] [--write]
+
+Windows of both references take turns. A window that contradicts the state is held; five held ones are judged as the
+agent does it (agent/core/hypotheses.py). Right: the device is named. Wrong: another one is. Undecided: neither, or
+fewer than five windows contradict within the thirty after the step, which is then a change that U covers.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from agent.core.hypotheses import Devices, confirmed
+from benchmarks.page import machine, write_part
+from calib.distributions import chi2_quantile
+from calib.estimate.nuisances import Priors
+from calib.estimate.record import Record
+from calib.estimate.state import State
+from calib.estimate.wander import TemperatureModel, Wander
+from hw.virtual.schedule import rotation
+from tests.building_windows import building_window
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
+SIZES, KINDS = (0.003, 0.005, 0.01, 0.03), ("sensor", "reference in use", "check reference", "mount")
+BEFORE, AFTER, HELD, LEVEL = 20, 30, 5, (0.3, 0.3, 0.3)
+MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
+U = np.append(np.where(np.eye(3).ravel() > 0, 0.02, 0.01), np.full(3, 0.5))
+TURNS = "ABBABAABBAABABBA"  # Thue and Morse
+PRIORS = Priors(reference=1e-3, reference_drift=5e-3, rotation_rad=3e-3, offset_mps2=0.01)
+
+
+def limit(degrees_of_freedom: float) -> float:
+    """Of chi-squared: one sound window in 10,000 has more."""
+    return chi2_quantile(1.0 - 1e-4, degrees_of_freedom)
+
+
+def verdict(kind: str, size: float, seed: int) -> str:
+    """What the agent says after the step: right, wrong or undecided."""
+    random = np.random.default_rng([seed, KINDS.index(kind), round(size * 1e4)])
+    state = State(MEAN, U, PRIORS, Wander(), TemperatureModel(), fixed=True, check=[PRIORS])
+    errors = {name: 1.0 + 1e-3 * random.standard_normal(3) for name in "AB"}
+    S = np.eye(3) + 0.01 * random.standard_normal((3, 3))
+    for place, name in enumerate("AB"):
+        state.use(place)
+        state.meet(name)
+    held: list[Record] = []
+    stepped = "A" if kind == "reference in use" else "B"
+    for k in range(BEFORE + AFTER):
+        name, day = TURNS[k % len(TURNS)], k / 24.0
+        if k == BEFORE and kind == "sensor":
+            S = S * (1.0 + size)
+        elif k == BEFORE and kind == "mount":
+            S = S @ rotation(np.array([0.6, 0.0, 0.8]), size)
+        elif k == BEFORE:
+            errors[stepped] = errors[stepped] * (1.0 + size)
+        window = building_window(random, level_mps2=LEVEL, S=S, reference_error=errors[name] - 1.0)
+        state.use("AB".index(name))
+        record = Record.of(window, day, reference=name, to_hz=state.motion_to_hz)
+        told = state.innovation(record)
+        if told.statistic <= limit(told.degrees_of_freedom) or k < BEFORE:
+            state.update(record)
+            continue
+        held.append(record)
+        if len(held) == HELD:
+            other = "B" if name == "A" else "A"
+            adopted, who = confirmed(state, held, Devices(name, other, 5e-3), limit)
+            if adopted is None or not who or "tells whether" in who:
+                return "undecided"
+            named = "sensor" if "the sensor has changed" in who else f"reference {who.split('the reference ')[1][0]}"
+            right = "sensor" if kind in ("sensor", "mount") else f"reference {stepped}"
+            return "right" if named == right else "wrong"
+    return "undecided"
+
+
+def table(seeds: Sequence[int]) -> str:
+    """A row for each kind, a column for each size."""
+    rows = [
+        "| step of | " + " | ".join(f"{100 * size:g} %" for size in SIZES) + " |",
+        "| --- " * (len(SIZES) + 1) + "|",
+    ]
+    for kind in KINDS:
+        found = []
+        for size in SIZES:
+            count = Counter(verdict(kind, size, seed) for seed in seeds)
+            found.append(f"{count['right']}, {count['wrong']}, {count['undecided']}")
+        rows.append(f"| {kind} | {' | '.join(found)} |")
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args()
+    text = f"`python -m benchmarks.hypotheses`, {machine()}. Right, wrong, undecided of {given.seeds}.\n\n"
+    text += table(range(given.seeds))
+    if given.write:
+        write_part("hypotheses", text, PAGE)
+    else:
+        print(text)

@@ -1,0 +1,65 @@
+"""Merged records: how many there are at most, and what neither a drift nor the order of records may change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib.estimate.estimate import estimate
+from calib.estimate.nuisances import Priors
+from calib.estimate.statements import Statements
+from calib.estimate.thinning import MOST, merged, thinned
+from calib.estimate.unknowns import Unknowns
+from calib.estimate.wander import TemperatureModel, Wander
+from calib.model import Pose
+from tests.drawn_records import UP, Truth, template, told
+
+S, Q = np.eye(3), np.array([0.2, -0.1, 0.4])
+MEAN, U = np.append(S.ravel(), Q), np.append(np.full(9, 0.02), np.full(3, 1.0))
+STILL = dict.fromkeys(Wander.none().values, 0.0)
+BESIDE = template(Pose("p", np.eye(3), UP), noise=1e-3)
+
+
+def test_there_are_never_more_records_than_a_state_may_have() -> None:
+    """Two references and twelve positions at three temperatures, each hour of two weeks and each day of a year."""
+    poses = [replace(BESIDE, pose=replace(BESIDE.pose, position=str(k))) for k in range(12)]
+    days = [*(-365.0 + np.arange(350)), *(-15.0 + np.arange(15 * 24) / 24.0)]
+    records = [
+        told(poses[k % 12], Truth(S, Q), float(day), degc=5.0 + 10.0 * (k // 12 % 3), reference="AB"[k // 36 % 2])
+        for k, day in enumerate(days)
+    ]
+    few = thinned(records, 0.0, S)
+    assert len(records) > MOST >= len(few) > MOST // 4
+    assert sum(record.windows for record in few) == len(records)
+
+
+def test_a_drift_of_q_over_a_season_is_not_taken_for_its_temperature() -> None:
+    """0.1 m/s2 in a hundred days in which it gets 8 K warmer: the windows tell nothing of Q over temperature."""
+    random, per_k = np.random.default_rng(1), 0.002
+    records = []
+    for day in np.arange(0.0, 100.0, 2.0):
+        above = 0.08 * day
+        Q_then = Q + 1e-3 * day + per_k * above
+        noise = 1e-3 * random.normal(size=3)
+        records.append(told(BESIDE, Truth(S, Q_then), float(day), degc=21.0 + above, mean_noise=noise))
+    walks = Wander(STILL | {"offset_mps2": 1e-3, "offset_rate_mps2": 2e-3})
+    model = TemperatureModel(1, 0, 20.0, (0.005, 0.0))
+    stated = Statements(MEAN, U, {"": Priors.none().with_values({"offset_mps2": 1e-3})}, walks, model)
+    now = estimate([merged(records[:-2], S), *records[-2:]], stated).now
+    for name in ("Qx_T1", "Qy_T1", "Qz_T1"):
+        k = now.index(name)
+        assert abs(now.mean[k] - per_k) < 3.0 * np.sqrt(now.variance[k])
+
+
+def test_an_unknown_begins_with_the_first_window_that_has_it_however_windows_were_merged() -> None:
+    """Of two merged records the one whose middle is later has the first window: the reference drifts from there on."""
+    early, late = (told(BESIDE, Truth(S, Q), day) for day in (50.0, 60.0))
+    records = [replace(early, days=(40.0, 60.0), windows=2), replace(late, days=(0.0, 120.0), windows=2)]
+    stated = Statements(
+        MEAN, U, {"": Priors.none().with_values({"reference_drift": 0.005})}, Wander(STILL), TemperatureModel(),
+        certified={"A": 0.0},
+    )  # fmt: skip
+    drift = next(own for own in Unknowns(stated, records).all if own.key == "reference_drift_x of A")
+    assert drift.since == 0.0
+    assert estimate(records, stated).days[0] == 0.0
