@@ -43,7 +43,7 @@ POINTS_A_PERIOD = 64  # of the fastest bump: cubic pieces are then accurate to 1
 # Nobody states the sensor's filter: the lag is stated as unknown to 20 ms.
 STATED = Stated(main_pct=3.0, transverse_pct=1.5, reference_pct=0.3, lag_s=0.02)
 BOUND_PCT = 100.0 / float(np.hypot(1.0 / 0.003, 1.0 / 0.03))  # u of S by its prior and one reference
-ORDERS: dict[str, Sequence[int]] = {"the first": (0,), "all but the first": range(1, WINDOWS)}  # visits with lorries
+ORDERS: dict[str, Sequence[int]] = {"the first": (0,)}  # visits with lorries
 Job = tuple[str, int]
 
 # At the level of records, without a front end: each letter is a window.
@@ -239,7 +239,7 @@ def records_table(found: Sequence[tuple[str, float, float, float]]) -> str:
 def table(found: Sequence[Outcome]) -> str:
     """One row for each order."""
     lines = [
-        f"| windows with lorries, of {WINDOWS} | runs | taken / held / refused | runs ending HELD | u of main S over "
+        f"| visits with lorries, of {WINDOWS} | runs | taken / held / refused | runs ending HELD | u of main S over "
         "the bound: mean, most | worst error, u | frequency of S, Hz |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
