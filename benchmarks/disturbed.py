@@ -85,7 +85,7 @@ def table(runs: int) -> list[str]:
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     clean: dict[tuple[float, float], float] = {}
-    with multiprocessing.Pool() as pool:
+    with multiprocessing.get_context("forkserver").Pool() as pool:
         for name in KINDS:
             for band_hz in BANDS_HZ:
                 found = pool.map(one, [(name, band_hz, seed) for seed in range(runs)], chunksize=1)

@@ -283,11 +283,11 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write docs/response.md")
     parser.set_defaults(of="table")
     which = parser.add_mutually_exclusive_group()
-    for of, told in (
-        ("known", "the table of stated filters"), ("skirts", "motion that reaches into a filter's edge"),
-        ("inside", "pairs with a fault in the motion"),
+    for option, told in (
+        ("--known", "the table of stated filters"), ("--skirts", "motion that reaches into a filter's edge"),
+        ("--inside", "pairs with a fault in the motion"),
     ):  # fmt: skip
-        which.add_argument(f"--{of}", dest="of", action="store_const", const=of, help=told)
+        which.add_argument(option, dest="of", action="store_const", const=option.removeprefix("--"), help=told)
     arguments = parser.parse_args()
     lines = TABLES[arguments.of](arguments.runs)
     if arguments.write:

@@ -130,7 +130,7 @@ def main(arguments: Sequence[str] = ("--write",)) -> int:
     tests = 2 * 12 * len(numbers)
     lines, faults, results = [HEADER], [], {}
     print(HEADER)
-    with multiprocessing.Pool(options.processes) as pool:
+    with multiprocessing.get_context("forkserver").Pool(options.processes) as pool:
         for number in numbers:
             row, start = ROWS[number], time.monotonic()
             count = options.together if row.name == "all together" else options.recordings

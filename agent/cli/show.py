@@ -75,6 +75,8 @@ def show(
         say(f"fieldcal show: {error}", err=True)
         return 2
     except OSError as error:
+        if error.filename is None:  # of standard output
+            raise
         say(f"fieldcal show: {error.filename or data_dir}: {error.strerror}", err=True)
         return 2
     return 3 if overview.refused else 0

@@ -15,7 +15,7 @@ from agent.core.gate import Limit
 from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
-from calib.estimate.quantities import OFFSET, RESPONSE, Kind, Quantity
+from calib.estimate.quantities import ALL_RATES, OFFSET, RESPONSE, Kind, Quantity
 from calib.estimate.record import Record
 from calib.estimate.state import State
 from calib.geometry import STANDARD_GRAVITY_MPS2
@@ -91,12 +91,12 @@ def _lines(state: State, jump: Array, fixed_mount: bool) -> dict[str, list[int]]
     quantities, lines, own = state.quantities, dict[str, list[int]](), {quantity.key for quantity in state.present}
     for k, quantity in enumerate(quantities):
         kind = quantity.kind
-        if quantity.key not in own:
+        if quantity.key not in own or quantity.name in ALL_RATES:
             continue
         stated = kind.source and _settings(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
         stated = stated or kind is RESPONSE
         if jump[k] > 0.0 if k < len(jump) else stated:
-            lines.setdefault(kind.source or kind.name, []).append(k)
+            lines.setdefault(kind.name if k < len(jump) else kind.source, []).append(k)
     if fixed_mount and OFFSET.name in lines:
         # A sensor that was turned on its mount has another mean output, too.
         turned = {line: members for line, members in lines.items() if quantities[members[0]].kind.unit == "rad"}

@@ -187,8 +187,10 @@ class Equations:
             for k, effect in enumerate(self._effect[:, live]):
                 own = self._pose_of == k
                 found[own, :, 12:] = by[own] @ effect
+        del by_inputs  # of a day much memory
         noise = np.tile(data.type_a.noise, 2 * data.channels)
-        white = [self.scatter.whiten(part) for part in (slope / noise, jacobians[0] / noise[..., None])]
+        jacobians[0] /= noise[..., None]
+        white = [self.scatter.whiten(part) for part in (slope / noise, jacobians[0])]
         shape, weight = data.slopes.shape, self.mean_weight
         return Rows(
             white[0].reshape(shape), white[1].reshape(*shape, n), mean * weight, jacobians[1] * weight[..., None],

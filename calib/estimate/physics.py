@@ -32,7 +32,7 @@ from calib.model import Array, own_channels
 from calib.signal.response import by_term
 
 STEP = 1e-30  # of the complex step: its square is lost beside 1, so that the derivative is exact
-AT_ONCE = 2000  # windows times inputs whose derivatives are found together: some 5 MB
+AT_ONCE = 1000  # windows times inputs whose derivatives are found together: some 3 MB
 _PARTS = {
     "S": 9, "Q": 3, "STRETCH": 3, "TURN": 3, "TURN_GRAVITY": 3, "ACROSS": 3, "AHEAD": 3, "LAG": 3, "CORNER": 1,
     "GRAVITY": 1, "REFERENCE": 3, "RESPONSE": TERMS, "OVER_T": 6,

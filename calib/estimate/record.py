@@ -107,7 +107,8 @@ class Record:
         """The record of a window that is used, of its motion up to `to_hz`; where no window before settled that, up to
         the end of its own motion that lasts."""
         found = excited(window)
-        if found.turned:
+        turned = found.turned and bool(found.noise.any())
+        if turned:
             found = excited_together([window])[0][0]
         motion_hz = motion_band_hz([window])
         lasts_hz = (
@@ -143,7 +144,7 @@ class Record:
             data.mean_x[0], data.mean_v[0][None], np.array([[1.0, t, t * t]]), temperature_degc,
             mean_input(window), float(data.count[0]), told, deviations, left_open,
             lasts_hz, mean_hz,
-            to_hz=ends_hz, bands=kept, reference_noise=noise, motion=motion_of(window) if found.turned else None,
+            to_hz=ends_hz, bands=kept, reference_noise=noise, motion=motion_of(window) if turned else None,
         )  # fmt: skip
         return made.within(to_hz) or made
 

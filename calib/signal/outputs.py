@@ -63,11 +63,8 @@ class Outputs:
         self.step = np.inf  # the smallest change of any output: the resolution
         self.sticks: NDArray[np.int64] = np.zeros(axes, dtype=np.int64)
         self.repeats = self.alone = self.flipped = 0
-        self._taken, self._begun, self._next = (
-            0,
-            0,
-            0,
-        )  # samples: so far, before they were counted anew, and missing ones
+        # Samples: so far, before they were counted anew, and the number of the next one.
+        self._taken = self._begun = self._next = 0
         self._rate_hz = 1.0
         self._last = np.full(axes, np.nan)
         # Since which of the samples that were taken, and since which number: an output has one value, and it is between
@@ -112,6 +109,7 @@ class Outputs:
         self._slow = np.vstack([self._slow, means])[-max(2, round(MOVED_S * rate_hz / width)) :]
 
     @property
+    @np.errstate(all="ignore")
     def motion(self) -> Array:
         """(A, A) covariance of slow means over the last MOVED_S, less than its noise there where that is much of it."""
         if len(self._slow) < FEWEST:
@@ -166,7 +164,7 @@ class Outputs:
             else:
                 back = x[::-1, k]
                 spread = np.maximum.accumulate(back) - np.minimum.accumulate(back)
-                count = int(np.searchsorted(spread, one_step, "right"))
+                count = max(int(np.searchsorted(spread, one_step, "right")), 1)
                 self._near[:, k] = self._taken + len(x) - count, first + len(x) - count
                 self._ends[:, k] = back[:count].min(), back[:count].max()
         self._last = x[-1]

@@ -79,7 +79,8 @@ def test_with_free_angles_s_and_q_are_within_their_uncertainty() -> None:
     u = np.array(update.standard_uncertainty)
     assert np.all(np.abs(found - truth) < 4.0 * u)
     nominal = world.parameters.sensor.nominal_sensitivity
-    assert np.all(u[[0, 4, 8]] < 0.005 * nominal)  # of 5 % that the data sheet left
+    # Of 5 % that the data sheet left. One of six positions is held here: S_yz would change by 3.4 %, more than 3 %.
+    assert np.all(u[[0, 4, 8]] < 0.01 * nominal)
     alphas = [r.numbers["found_alpha_deg"] for r in reports if "found_alpha_deg" in r.numbers and r.used]
     assert alphas
     stated = np.array([alpha_deg for _, alpha_deg in bench.STOPS])

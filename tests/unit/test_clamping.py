@@ -94,12 +94,12 @@ def test_what_the_reference_forbids_is_said():
 
 
 def test_u_grows_as_the_configuration_states():
-    """After a year: a walk of 0.005 % a day, and 10 K at 0.02 %/K; the date is where U crosses the limit."""
+    """After a year: a walk of 0.018 % a day, and 10 K at 0.02 %/K; the date is where U crosses the limit."""
     channel = Visit.drawn(1, Clamped()).channel
     u_main = 0.001
     later = Growth(channel, np.eye(3), np.full(12, u_main**2), 10.0)
     year_days = 12.0 * MONTH_DAYS
-    expected = 200.0 * np.sqrt(u_main**2 + (5e-5) ** 2 * year_days + (2e-4 * 10.0) ** 2)
+    expected = 200.0 * np.sqrt(u_main**2 + (1.8e-4) ** 2 * year_days + (2e-4 * 10.0) ** 2)
     assert later.main_pct(year_days) == pytest.approx(expected, rel=1e-6)
     assert later.main_pct(0.0) == pytest.approx(0.2)
     days = later.days_until(0.5)

@@ -35,6 +35,7 @@ ELSEWHERE = {
     "mpu9150": "agent.calibrate.printing", "imports": "docs.images.import_graph", "worked": "docs.worked_budget",
     "transitions": "",  # a table of rules, which tests/properties/test_gate.py compares
     "site-runs": "benchmarks.site", "site-large": "benchmarks.site",
+    **dict.fromkeys(("table", "known", "skirts", "inside"), "benchmarks.response"), "walks": "benchmarks.walks",
     "faults": "tests.faults.outcome", "soak-day": "benchmarks.soak", "soak-hour": "benchmarks.soak",
     **{name: f"benchmarks.online.{name}" for name in
        ("agreement", "bench", "chip", "cost", "coverage", "day", "filters", "harm", "lorries",

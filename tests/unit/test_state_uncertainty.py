@@ -63,7 +63,7 @@ def test_nuisances_that_come_after_a_calibration_was_put_in_force_are_as_doubtfu
     found.put(Calibration(S, Q, covariance, told_by, np.inf, "3"))
     np.testing.assert_allclose(found.result().covariance, 2.0 * covariance, rtol=1e-5, atol=1e-12)
     again = record(template(Pose("new", np.eye(3), -UP)), 1.0)
-    new = {unknown.key: unknown.u for unknown in found._know(again).unknowns.all}
+    new = {unknown.key: unknown.u for unknown in found._know(again)[1].unknowns.all}
     assert new["gravity_x[new]"] == pytest.approx(np.sqrt(2.0) * 0.002, rel=1e-12)
     assert new["offset_x[new]"] == pytest.approx(np.sqrt(2.0) * 0.02, rel=1e-12)
     assert new["gravity_x[p]"] == 0.002
