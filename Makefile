@@ -35,9 +35,9 @@ once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-faile
 # Two for each processor: one of them takes scenarios, which mostly wait for programs that they start (tests/conftest.py).
 PROCESSES = $$((2 * $$(nproc)))
 
-# The drivers' contract reads 200,000 samples here, which a counter of 16 bits does three times; `pytest tests/contract`
+# The drivers' contract reads 140,000 samples here, which a counter of 16 bits does twice; `pytest tests/contract`
 # reads a million.
-test: export FIELDCAL_CONTRACT_SAMPLES = 200000
+test: export FIELDCAL_CONTRACT_SAMPLES = 140000
 test: $(VENV)/development
 	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadscope -m "not faults" || \
 		$(call once_more,-m "not faults")
