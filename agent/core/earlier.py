@@ -60,8 +60,15 @@ def _from_version_5(state: dict[str, Any]) -> None:
         holder |= {"filters": {}, "device": ""}
 
 
+def _from_version_8(state: dict[str, Any]) -> None:
+    """Nobody watched the blocks as they came."""
+    for channel in state.get("channels", {}).values():
+        channel["raw"] = {"outputs": {}, "faults": {}, "told_s": {}, "seen": {}}
+
+
 CHANGES: Mapping[int, Callable[[dict[str, Any]], None]] = {
     1: _from_version_1,
     2: _from_version_2,
     5: _from_version_5,
+    8: _from_version_8,
 }

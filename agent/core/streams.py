@@ -256,8 +256,7 @@ class Streams:
         }
         self._places.load(state["places"])
         self._runs, self._number = dict(state["run_numbers"]), state["piece_number"]
-        if "raw" in state:  # earlier states have none
-            self._raw.load(state["raw"])
+        self._raw.load(state["raw"])
 
     @property
     def _sensor(self) -> DeviceStream:

@@ -28,7 +28,7 @@ from calib.estimate.solution import Solution, slope_residuals, solve
 from calib.estimate.verdict import misfit, nothing_determined, nuisance_pull, reasons, turned_windows
 from calib.excitation.bands import motion_band_hz
 from calib.excitation.excited import excited_together
-from calib.model import Array, Calibration, Pose, Window
+from calib.model import Array, Calibration, Window
 
 SCATTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
 SCATTER_SETTLED = 0.05
@@ -70,7 +70,8 @@ class Grounds:
 
     def _turned(self, static: int, factor: float) -> Solution:
         turned, _ = excited_together(turned_windows(self.windows, static, factor))
-        return _solution([e.pose for e in turned], self.data, self.priors, self.applied, self.scatter, self.ways)
+        held = [e.pose for e in turned]
+        return solve(Equations(self.data, held, self.priors, self.applied, self.scatter, self.ways), self.priors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,13 +171,13 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     held = [e.pose for e in found]
-    solution = _solution(held, data, priors, applied, scatter, ways)
+    solution = solve(Equations(data, held, priors, applied, scatter, ways), priors)
     for _ in range(SCATTER_TURNS if priors.lag_s > 0.0 else 0):
         larger = estimated(scatter, *slope_residuals(solution), data.type_a.slopes)
         if larger.lag_s.max() <= (1.0 + SCATTER_SETTLED) * scatter.lag_s.max():
             break
         scatter = larger
-        solution = _solution(held, data, priors, applied, scatter, ways)
+        solution = solve(Equations(data, held, priors, applied, scatter, ways), priors)
     shares = budget(solution, priors.offset_mps2, priors.known_u)
     mean, covariance = solution.x[:12], shares.covariance[:12, :12]
     prior_u = _prior_u(stated, solution.equations.output_per_mps2)
@@ -236,13 +237,6 @@ def _response(
         k,
         known=Known.of(priors),
     )
-
-
-def _solution(
-    held: Sequence[Pose], data: Condensed, priors: Priors, applied: Applied, scatter: SlopeScatter, ways: Array
-) -> Solution:
-    """`held`: the pose of each window; `ways` (3, k): the directions that the windows excite."""
-    return solve(Equations(data, held, priors, applied, scatter, ways), priors)
 
 
 def _prior_u(priors: Priors, scale: float) -> Array:

@@ -122,11 +122,9 @@ class OverFrequency:
         if self.motion_hz is None or not (several or another or self.left_out > before.left_out):
             return ""
         low_hz, high_hz = self.motion_hz
-        found = (
-            "the channel states this band"
-            if self.fixed
-            else (f"{self.windows} windows have this band in common" + ("" if several else ", and may still change it"))
-        )
+        found = f"{self.windows} windows have this band in common{'' if several else ', and may still change it'}"
+        if self.fixed:
+            found = "the channel states this band"
         left_out = self.left_out - before.left_out
         lost = f"; {left_out} older windows with motion above it are left out" if left_out else ""
         remedy = "" if self.fixed else ". Set band_hz of the channel if another band is to be used"

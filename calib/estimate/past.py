@@ -12,9 +12,8 @@ from calib.model import Array
 from calib.signal.order_statistics import distinct
 
 REACH_DAYS = 1.0 / 24.0  # before the first and after the last epoch S and Q are held for so long
-FURTHEST_DAYS = (
-    7.0  # between two epochs. A walk of Q by 2 mm/s2 a root day adds 2.6 mm/s2 in the middle of so long a gap
-)
+# Between two epochs. A walk of Q by 2 mm/s2 a root day adds 2.6 mm/s2 in the middle of so long a gap.
+FURTHEST_DAYS = 7.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

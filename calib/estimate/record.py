@@ -50,7 +50,7 @@ class Record:
     Response: `told` (r, TERMS + 1): rows of its terms alone; `deviations` and `left_open`: what the bands say beside.
     `motion_hz`: the band of the motion that lasts, also where less of it was used; None where it tells no response.
     `mean_hz`: the mean frequency of what was used, 0 at rest.
-    `misfit` (2,): chi-squared by which the slopes of merged windows differ, and its degrees of freedom. `motion`: that
+    `motion`: that
     of a window whose directions the noise of the reference turns (see `together`), None of any other.
 
     `to_hz`: no motion above it is in the sums. `bands`: the sums of the newest windows by band, from which `within`
@@ -88,7 +88,6 @@ class Record:
     left_open: LeftOpen
     motion_hz: tuple[float, float] | None
     mean_hz: float
-    misfit: tuple[float, float] = (0.0, 0.0)
     motion: Motion | None = None
     to_hz: float = np.inf
     bands: BandSums | None = None
@@ -111,10 +110,10 @@ class Record:
         if turned:
             found = excited_together([window])[0][0]
         motion_hz = motion_band_hz([window])
-        lasts_hz = (
-            None if motion_hz is None else window.motion_hz or motion_band_hz([window], lasting=True) or motion_hz
-        )
-        if lasts_hz is not None and to_hz == np.inf:
+        lasts_hz = window.motion_hz or motion_band_hz([window], lasting=True) or motion_hz
+        if motion_hz is None:
+            lasts_hz = None
+        elif to_hz == np.inf and lasts_hz is not None:
             to_hz = WIDER * lasts_hz[1]
         data = condense([found], response_hz=to_hz, one_frequency=motion_hz is None)
         channels = data.channels
@@ -243,7 +242,7 @@ class Record:
     @classmethod
     def load(cls, state: Mapping[str, Any]) -> Record:
         """The record whose snapshot this is."""
-        pairs = {name: tuple(state[name]) for name in ("days", "response", "misfit")}
+        pairs = {name: tuple(state[name]) for name in ("days", "response")}
         band, bands, motion = state["motion_hz"], state["bands"], state["motion"]
         own = {
             "pose": Pose(**state["pose"]), "deviations": Deviations(**state["deviations"]),

@@ -204,9 +204,8 @@ class _Slopes:
         walks = np.sqrt(unknowns.a_day[[0, 4, 8]])
         self._walked = windows.moved[:, :, None, :] * walks[:, None] / own.noise[:, None, :, None]
         drifted = np.sqrt(self._stretch / YEAR_DAYS) * [p.of(REFERENCE_DRIFT.prior) for p in priors]
-        self._drifted = (
-            _by_channel(windows).reshape(len(records), n, own_channels(windows.channels)) * drifted[:, None, None]
-        )
+        by_channel = _by_channel(windows).reshape(len(records), n, own_channels(windows.channels))
+        self._drifted = by_channel * drifted[:, None, None]
         self._noise = np.tile(own.noise, n // 3)
         self.weights = self._inverse() / self._noise[:, None] if n else np.zeros((len(records), 0, 0))
 

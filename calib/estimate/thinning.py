@@ -67,7 +67,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
         return np.asarray(sum(w * getattr(r, name) for w, r in zip(share, records, strict=True)))
 
     noise = np.sqrt(sum(w * r.noise**2 for w, r in zip(share, records, strict=True)))
-    root, slopes, passed, left, rank = _stacked(records, noise, m2)
+    root, slopes, passed = _stacked(records, noise, m2)
     mean_x = mean("mean_x")
     D = first.pose.direction
     # The means of V at one mean of the reference: its own motion moves them by S as nearly as nominal.
@@ -94,17 +94,13 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
         temperature_degc=float(share @ [r.temperature_degc for r in records]), held_mps2=mean("held_mps2"),
         count=float(sum(r.count for r in records)), told=_triangle(np.vstack([r.told for r in records]), TOLD),
         deviations=deviations, left_open=left_open, mean_hz=float(share @ [r.mean_hz for r in records]),
-        misfit=(
-            sum(r.misfit[0] for r in records) + float(np.sum((left / noise) ** 2)),
-            sum(r.misfit[1] for r in records) + 3.0 * rank * (len(records) - 1),
-        ),
         motion=reduce(Motion.plus, motions) if motions else None,
         to_hz=max(r.to_hz for r in records), bands=None, reference_noise=None,
     )  # fmt: skip
 
 
-def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, Array, Array, Array, int]:
-    """R, R b and R P of all together, what the slopes differ by (r, 3), and the rank of R.
+def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, Array, Array]:
+    """R, R b and R P of all together.
 
     A window's rows count by its own noise, as if all had the noise of the merged one.
     """
@@ -119,7 +115,7 @@ def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, A
     k, found = int(live.sum()), np.zeros((m2, wide.shape[1]))
     found[np.ix_(live, live)], found[live, m2:] = triangle[:k, :k], triangle[:k, k:]
     passed = found[:, m2 + 3 :].reshape(m2, TERMS, half).transpose(1, 0, 2)
-    return found[:, :m2], found[:, m2 : m2 + 3], passed, triangle[k : k + 3, k : k + 3], k
+    return found[:, :m2], found[:, m2 : m2 + 3], passed
 
 
 def _triangle(rows: Array, most: int) -> Array:
