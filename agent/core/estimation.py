@@ -177,7 +177,7 @@ class Estimation:
         self, window: Window, day: float, lag_s: float, temperature_degc: float, anew: Anew | None = None
     ) -> Judged:
         """Take, hold or refuse one used window. `anew`: the search that found its lag, if there was one."""
-        told, whole = self._close_day(day)
+        told, whole = self._before_window(day)
         if anew is None:
             tried = self._tried_of(window, day, lag_s, temperature_degc)
         else:
@@ -237,15 +237,16 @@ class Estimation:
         """What the newest window, which was taken, has changed besides S and Q."""
         return "; ".join(filter(None, (self.lag_watch.taken(self.state), self.state.settled_since(earlier))))
 
-    def _close_day(self, day: float) -> tuple[list[DriftVerdict], Estimate | None]:
-        """At the first window of a day: net changes of S and Q are judged, and the whole is solved anew. Returns what
-        was found, and the solution."""
-        if not self.state.begins_day(day):
-            return [], None
-        told = self.walks.update(self.state.shown())
-        self.state.widen(self.walks.widened)
-        self._tried = None
-        return told, self.state.close_day(day)
+    def _before_window(self, day: float) -> tuple[list[DriftVerdict], Estimate | None]:
+        """Old records are merged; at the first window of a day, net changes of S and Q are judged before. Returns what
+        was found, and the solution if the whole was solved anew."""
+        told: list[DriftVerdict] = []
+        if self.state.begins_day(day):
+            told = self.walks.update(self.state.shown())
+            self.state.widen(self.walks.widened)
+        if (whole := self.state.merge_old(day)) is not None:
+            self._tried = None
+        return told, whole
 
     def explain(self, now_s: float) -> str:
         """What explains the held windows, once in each `explain_after_s` while there are any; else "".

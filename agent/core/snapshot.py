@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import msgspec
@@ -10,7 +11,8 @@ import numpy as np
 from agent.core.earlier import brought_up
 
 VERSION = 9
-_ARRAY = 1  # msgpack extension code for a numpy array
+_ARRAY, _SPARSE = 1, 2  # msgpack extension codes of a numpy array: all its elements, or those that are not zero
+_MOST_SPARSE = 1 << 24  # elements of all sparse arrays together; the largest state has a tenth of it
 
 
 def pack(state: dict[str, Any]) -> bytes:
@@ -27,7 +29,7 @@ def unpack(data: bytes) -> dict[str, Any]:
     Raises ValueError if the bytes are no snapshot, or if this program does not know their version.
     """
     try:
-        held = msgspec.msgpack.decode(data, ext_hook=_decode_array)
+        held = msgspec.msgpack.decode(data, ext_hook=_Arrays().decode)
         version, state = held["version"], held["state"]
     except (msgspec.DecodeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"not a snapshot: {error}") from None
@@ -46,19 +48,44 @@ def unpack(data: bytes) -> dict[str, Any]:
 def _encode(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         head = msgspec.msgpack.encode([value.dtype.str, list(value.shape)])
-        return msgspec.msgpack.Ext(_ARRAY, bytes([len(head)]) + head + np.ascontiguousarray(value).tobytes())
+        dense = np.ascontiguousarray(value).tobytes()
+        elements = np.frombuffer(dense, dtype=np.dtype((np.void, value.dtype.itemsize)))
+        there = elements != np.zeros((), elements.dtype)  # by bits: -0.0 is there
+        sparse = np.packbits(there).tobytes() + elements[there].tobytes()
+        code, data = (_SPARSE, sparse) if len(sparse) < len(dense) else (_ARRAY, dense)
+        return msgspec.msgpack.Ext(code, bytes([len(head)]) + head + data)
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"a snapshot cannot hold a {type(value).__name__}")
 
 
-def _decode_array(code: int, data: memoryview) -> Any:
-    if code != _ARRAY:
-        raise ValueError(f"unknown extension {code}")
-    raw = bytes(data)
-    start = 1 + raw[0]
-    dtype, shape = msgspec.msgpack.decode(raw[1:start])
-    return np.frombuffer(raw, dtype=np.dtype(dtype), offset=start).reshape(shape).copy()
+class _Arrays:
+    """The arrays of one snapshot. Whoever wrote it, they take no more memory than its bytes and _MOST_SPARSE allow."""
+
+    def __init__(self) -> None:
+        self._left = _MOST_SPARSE
+
+    def decode(self, code: int, data: memoryview) -> Any:
+        """The array of an extension."""
+        if code not in (_ARRAY, _SPARSE):
+            raise ValueError(f"unknown extension {code}")
+        raw = bytes(data)
+        start = 1 + raw[0]
+        name, shape = msgspec.msgpack.decode(raw[1:start])
+        dtype = np.dtype(name)
+        if code == _ARRAY:
+            return np.frombuffer(raw, dtype=dtype, offset=start).reshape(shape).copy()
+        size = math.prod(shape)
+        self._left -= size
+        if self._left < 0:
+            raise ValueError(f"its sparse arrays have more than {_MOST_SPARSE} elements")
+        found, end = np.zeros(size, dtype=dtype), start + (size + 7) // 8
+        there = np.unpackbits(np.frombuffer(raw[start:end], dtype=np.uint8), count=size).astype(bool)
+        values = np.frombuffer(raw, dtype=dtype, offset=end)
+        if len(values) != np.count_nonzero(there):
+            raise ValueError(f"a sparse array has {len(values)} values")
+        found[there] = values
+        return found.reshape(shape)
 
 
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=_encode)

@@ -2,7 +2,8 @@
 
 A window is predicted, and appended to the newest epoch, without a look at the others. The whole is solved anew
 (calib.estimate.estimate) where a statement changed, where the estimate has moved so far that windows must be linearised
-again, and at the end of each day of the data, when old records are merged (calib.estimate.thinning).
+again, and where old records are merged (calib.estimate.thinning): at the end of each day of the data, and within a day
+after each 48 windows.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from calib.estimate.response_told import ResponseTold
 from calib.estimate.rows import Noise
 from calib.estimate.sources import Sources
 from calib.estimate.statements import DOUBT, Dated, Statements, Step, Widening
-from calib.estimate.thinning import thinned
+from calib.estimate.thinning import NEWEST, thinned
 from calib.estimate.walks import Shown, shown
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array, Calibration, scale_of
@@ -101,7 +102,7 @@ class State:
         self._read: tuple[Now, str, Array, Array] | None = None  # what `_values` found
         self._stated_then: Any = None  # what was stated when a loaded state was kept, if that is another now
         self._newest_day: int | None = None  # of the data; None before any window
-        self.windows = 0
+        self.windows, self._merged_at = 0, 0  # windows that were taken: until now, and when records were merged last
 
     # --- reading
 
@@ -462,16 +463,17 @@ class State:
 
     def update(self, record: Record) -> None:
         """Take a window."""
-        self.close_day(record.day)
+        self.merge_old(record.day)
         record, ahead = self._know(record)
         self._take(record, ahead, ahead.rows(self._directed(record)))
 
-    def close_day(self, day: float) -> Estimate | None:
-        """At the first window of a day of the data: old records are merged, and the whole is solved anew. Returns the
-        solution; None where the day is not over."""
-        if not self.begins_day(day):
+    def merge_old(self, day: float) -> Estimate | None:
+        """Before a window on this day: old records are merged and the whole is solved anew, where a day of the data is
+        over or so many windows came that the state would grow. Returns the solution; None where neither is so."""
+        if not self.begins_day(day) and self.windows - self._merged_at < NEWEST:
             return None
-        self._newest_day = int(np.floor(day))
+        self._merged_at = self.windows
+        self._newest_day = None if self._newest_day is None else max(self._newest_day, int(np.floor(day)))
         cuts = [step.day for step in self._moving_steps]
         records = together(self._records, fixed=self._mean_is_held)
         self._records = _newest(thinned(records, day, self._now.mean[:9].reshape(3, 3), cuts))
@@ -720,6 +722,7 @@ class State:
             "stated": self._stated(),
             "newest_day": self._newest_day,
             "windows": self.windows,
+            "merged_at": self._merged_at,
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
@@ -736,7 +739,7 @@ class State:
         self._over = OverFrequency.load(state["over"])
         self._held_mps2 = None if state["held_mps2"] is None else np.array(state["held_mps2"])
         self._fixed = self._fixed and state["fixed"]  # a mount that turned once is fixed no more
-        self._newest_day, self.windows = state["newest_day"], state["windows"]
+        self._newest_day, self.windows, self._merged_at = state["newest_day"], state["windows"], state["merged_at"]
         self._now = Now.load(state["now"], self.statements, self._records)
         self._stated_then = None if state["stated"] == self._stated() else state["stated"]
 

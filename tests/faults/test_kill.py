@@ -20,9 +20,9 @@ def test_at_random_moments(tmp_path: Path) -> None:
     assert outcome.findings.restored >= 4, outcome
 
 
-def test_at_every_fifteenth_write(tmp_path: Path) -> None:
+def test_at_every_fortieth_write(tmp_path: Path) -> None:
     require("strace")
-    outcome = kill.at_every_write(tmp_path, 15)
+    outcome = kill.at_every_write(tmp_path, 40)
     assert outcome.good, outcome
     assert outcome.findings.calibrations > 8, outcome
 
