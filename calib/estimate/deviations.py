@@ -18,6 +18,9 @@ from calib.signal.order_statistics import median
 from calib.signal.response import POWERS, by_term
 
 PROBABILITY = 0.99  # confidence of the test for scatter between bands
+# To which the variance of the noise of bands is known: it is taken to be steady, and noise that comes with gusts and
+# lorries gives the slopes of bands up to a fifth more (benchmarks.online.bridge). So much shows no other response.
+NOISIER = 1.2
 SURELY = 3.0  # standard uncertainties of noise beyond the white noise that chance does not explain
 LEAST_SHOWN = 0.1  # of the motion of the axis that moved most: noise of an axis with less says little of the reference
 MEDIAN_U = 1.2533  # standard uncertainty of a median over that of a mean
@@ -78,7 +81,7 @@ class Deviations:
     @property
     def times_noise(self) -> float:
         """The variance of the rows over that of their noise; 1 where noise alone shows as much in one of 100 cases."""
-        if self.freedom < 1.0 or self.square <= chi2_quantile(PROBABILITY, self.freedom):
+        if self.freedom < 1.0 or self.square <= NOISIER * chi2_quantile(PROBABILITY, self.freedom):
             return 1.0
         return max(self.square / self.freedom, 1.0)
 
@@ -87,7 +90,7 @@ class Deviations:
         """The deviations beyond noise, which shows as much in one of 100 cases."""
         if self.freedom < 1.0:
             return BetweenBands()
-        excess = self.square - self.freedom if self.times_noise > 1.0 else 0.0
+        excess = self.square - NOISIER * self.freedom if self.times_noise > 1.0 else 0.0
         shifted = self.moved**2 > chi2_quantile(PROBABILITY, 1.0) * self.variance
         shift = abs(self.moved) / self.power if shifted else 0.0
         return BetweenBands(float(np.sqrt(max(excess, 0.0) / self.signal)), shift, self.at_hz, self.largest)
