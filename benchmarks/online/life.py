@@ -64,7 +64,7 @@ class Gateway:
         self._sensor = config.channels[0].sensor
         self._kept: dict[str, bytes] = {}
         self._last_sequence = self._runs = 0
-        self._in_force: CalibrationUpdate | None = None
+        self.in_force: CalibrationUpdate | None = None
         self._worst = 0.0
         self._least = np.full(3, np.inf)
         self.restart(config)
@@ -91,7 +91,7 @@ class Gateway:
                 elif isinstance(result, Estimate):
                     self.estimate = result
                 elif isinstance(result, CalibrationUpdate):
-                    self._in_force = result
+                    self.in_force = result
                     self._least = np.minimum(self._least, self._u_main_pct())
                 if isinstance(result, Result):
                     self._last_sequence = result.sequence
@@ -122,7 +122,7 @@ class Gateway:
         )  # fmt: skip
 
     def _errors(self) -> Array:
-        update = self._in_force
+        update = self.in_force
         if update is None:
             return np.full(12, np.nan)
         value = np.append(np.ravel(update.sensitivity), update.offset)
@@ -130,7 +130,7 @@ class Gateway:
         return np.where(update.determined, (value - self.truth) / u, np.nan)
 
     def _u_main_pct(self) -> Array:
-        update = self._in_force
+        update = self.in_force
         if update is None:
             return np.full(3, np.nan)
         known = np.array(update.determined)[MAIN]

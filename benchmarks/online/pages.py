@@ -13,6 +13,7 @@ from typing import Any
 from benchmarks.online import (
     agreement,
     bench,
+    bridge,
     chip,
     cost,
     coverage,
@@ -84,6 +85,10 @@ def _lorries(workers: int, runs: int | None) -> tuple[Path, str]:
     records = [(order, seed) for order in lorries.RECORDS for seed in range(count)]
     whole = lorries.table(spread(lorries.one, lorries.jobs(count), workers))
     return ONLINE, f"{lorries.records_table(spread(lorries.of_records, records, workers))}\n\n{whole}"
+
+
+def _bridge(workers: int, runs: int | None) -> tuple[Path, str]:
+    return ONLINE, bridge.table(spread(bridge.one, bridge.jobs(runs or bridge.RUNS), workers))
 
 
 def _chip(workers: int, runs: int | None) -> tuple[Path, str]:
@@ -169,6 +174,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "chip": _chip,
     "touched": _touched,
     "lorries": _lorries,
+    "bridge": _bridge,
     "drift": _drift,
     "references": _references,
     "day": _day,
