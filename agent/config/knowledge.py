@@ -232,6 +232,16 @@ class Temperature(Section):
             )
         return self
 
+    @property
+    def model(self) -> TemperatureModel:
+        """The same, with what is left out filled in."""
+        order = min(self.offset_order, 1) if self.sensitivity_order is None else self.sensitivity_order
+        degc = 20.0 if self.reference_degc is None else self.reference_degc
+        u_offset = self.u_offset_mps2_per_k, self.u_offset_mps2_per_k2
+        return TemperatureModel(
+            self.offset_order, order, degc, u_offset, self.u_sensitivity_pct_per_k / 100.0, self.reference_degc is None
+        )
+
 
 class Knowledge(Section):
     """Base of a channel: all its sections of what is known beforehand."""
@@ -296,8 +306,4 @@ class Knowledge(Section):
 
     def temperature_model(self) -> TemperatureModel:
         """Dependence on temperature."""
-        t = self.temperature
-        order = min(t.offset_order, 1) if t.sensitivity_order is None else t.sensitivity_order
-        settles, degc = t.reference_degc is None, 20.0 if t.reference_degc is None else t.reference_degc
-        u_offset, u_sensitivity = (t.u_offset_mps2_per_k, t.u_offset_mps2_per_k2), t.u_sensitivity_pct_per_k / 100.0
-        return TemperatureModel(t.offset_order, order, degc, settles, u_offset, u_sensitivity)
+        return self.temperature.model

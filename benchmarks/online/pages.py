@@ -22,6 +22,7 @@ from benchmarks.online import (
     harm,
     lorries,
     references,
+    temperature,
     touched,
     year,
 )
@@ -155,6 +156,11 @@ def _references(workers: int, runs: int | None) -> tuple[Path, str]:
     return ONLINE, references.table([(name, spread(references.one, own, workers)) for name, own in jobs.items()])
 
 
+def _temperature(workers: int, runs: int | None) -> tuple[Path, str]:
+    lines = temperature.jobs(runs or temperature.RUNS)
+    return ONLINE, temperature.table([spread(temperature.one, own, workers) for own in lines])
+
+
 def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
     return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
 
@@ -171,6 +177,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "lorries": _lorries,
     "drift": _drift,
     "references": _references,
+    "temperature": _temperature,
     "day": _day,
     "cost": _cost,
 }

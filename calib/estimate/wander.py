@@ -60,9 +60,9 @@ class TemperatureModel:
     offset_order: int = 0
     sensitivity_order: int = 0
     reference_degc: float = 20.0
-    settles: bool = False
     u_offset_mps2: tuple[float, float] = (0.01, 2e-4)  # per K, per K2
     u_sensitivity: float = 2e-4  # per K
+    settles: bool = False
 
     def of_offset(self, scale: float) -> list[tuple[Quantity, float]]:
         """Coefficients of Q, each with its standard uncertainty before any data; `scale` is output unit per m/s2."""
