@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from agent.config.knowledge import Temperature
 from agent.core.snapshot import pack, unpack
 from agent.export.samples import acceleration
-from benchmarks.online.temperature import Drawn, World, estimation
+from benchmarks.online.temperature import Drawn, World, estimation, over_u
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
 from calib.estimate.record import Record
@@ -125,6 +125,16 @@ def test_a_body_that_is_two_hours_behind_the_thermometer_contradicts_nothing() -
     assert np.abs(error).max() < 0.015  # three times the rotation of 0.2 deg
 
 
+def test_a_window_without_a_temperature_may_have_had_any_of_those_before() -> None:
+    """A thermometer that fails after two days of 25 K, with 0.03 %/K: S stays, and U covers what it may be."""
+    drawn, found = Drawn(World("", 25.0, transverse=3e-4), np.random.default_rng(5)), estimation(constant=False)
+    for k in range(72):
+        degc = drawn.degc(k / 24) if k < 48 else float("nan")
+        assert found.judge(drawn.window(k / 24), k / 24, 0.0, degc).decision.action == "take"
+    error = over_u(found.law.at(float("nan")), drawn.truth(drawn.body_degc(71 / 24)))
+    assert np.abs(error).max() < 3.0
+
+
 def test_the_order_of_s_follows_that_of_q_and_can_be_stated() -> None:
     for offset, stated, order in ((1, None, 1), (2, None, 1), (0, None, 0), (1, 0, 0), (2, 1, 1)):
         section = Temperature(offset_order=offset, sensitivity_order=stated)
@@ -144,4 +154,6 @@ def test_exported_samples_are_corrected_at_their_temperature() -> None:
         + update.offset
         + 15.0 * np.array([1.0, 0.0, -2.0])
     )
-    np.testing.assert_allclose(acceleration(V, update, 25.0), a, rtol=1e-12)
+    found = acceleration(V, update, 25.0)
+    assert found is not None
+    np.testing.assert_allclose(found, a, rtol=1e-12)
