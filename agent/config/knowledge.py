@@ -130,6 +130,9 @@ class Certificate(Section):
     calibrated: IsoDate = ""
     interval_years: Annotated[float | None, Field(gt=0, le=100)] = None
     stability_pct: Annotated[float, Field(ge=0, le=50, description="standard uncertainty that a year adds")] = 0.35
+    u_sensitivity_pct_per_k: Annotated[
+        float, Field(ge=0, le=5, description="by which it may change with temperature; 0: it does not")
+    ] = 0.02
 
     @model_validator(mode="after")
     def _interval(self) -> Certificate:
@@ -207,15 +210,37 @@ class Process(Section):
 class Temperature(Section):
     """Dependence on temperature as a polynomial about `reference_degc`; order 0 is a constant.
 
-    First uncertainties of the coefficients: data sheets say 0.15 mg/K and 0.01 %/K of a good MEMS.
+    Where no temperature of the sensor is told, S is a constant. `sensitivity_order` left out is 0 where `offset_order`
+    is, else 1. `reference_degc` left out is the temperature of the first window that tells one, in whole degrees.
+    First uncertainties of the coefficients: data sheets say 0.01 %/K (ADXL313, ADXL350) to 0.026 %/K and 0.8 mg/K
+    (ICM-20948, DS-000189).
     """
 
     offset_order: Annotated[int, Field(ge=0, le=2)] = 1
-    sensitivity_order: Annotated[int, Field(ge=0, le=1)] = 0
-    reference_degc: Annotated[float, Field(ge=-60, le=150)] = 20.0
+    sensitivity_order: Annotated[int | None, Field(ge=0, le=1)] = None
+    reference_degc: Annotated[float | None, Field(ge=-60, le=150)] = None
     u_offset_mps2_per_k: Positive = 0.01
     u_offset_mps2_per_k2: Positive = 2e-4
-    u_sensitivity_pct_per_k: Positive = 0.02
+    u_sensitivity_pct_per_k: Positive = 0.02  # of each element of S, over the main sensitivity
+
+    @model_validator(mode="after")
+    def _orders(self) -> Temperature:
+        if self.sensitivity_order and not self.offset_order:
+            raise ValueError(
+                "sensitivity_order 1 needs offset_order 1 or 2, because under gravity a sensitivity that changes moves "
+                "the mean; state that, or sensitivity_order = 0"
+            )
+        return self
+
+    @property
+    def model(self) -> TemperatureModel:
+        """The same, with what is left out filled in."""
+        order = min(self.offset_order, 1) if self.sensitivity_order is None else self.sensitivity_order
+        degc = 20.0 if self.reference_degc is None else self.reference_degc
+        u_offset = self.u_offset_mps2_per_k, self.u_offset_mps2_per_k2
+        return TemperatureModel(
+            self.offset_order, order, degc, u_offset, self.u_sensitivity_pct_per_k / 100.0, self.reference_degc is None
+        )
 
 
 class Knowledge(Section):
@@ -281,11 +306,4 @@ class Knowledge(Section):
 
     def temperature_model(self) -> TemperatureModel:
         """Dependence on temperature."""
-        t = self.temperature
-        return TemperatureModel(
-            t.offset_order,
-            t.sensitivity_order,
-            t.reference_degc,
-            (t.u_offset_mps2_per_k, t.u_offset_mps2_per_k2),
-            t.u_sensitivity_pct_per_k / 100.0,
-        )
+        return self.temperature.model

@@ -145,7 +145,8 @@ class Estimation:
         return self.state.response
 
     def _record(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Record:
-        return Record.of(window, day, lag_s, temperature_degc, self.state.reference, self.state.motion_to_hz)
+        made = Record.of(window, day, lag_s, temperature_degc, self.state.reference, self.state.motion_to_hz)
+        return self.state.with_body(made)
 
     def date_certificate(self, day: float, utc_ns: int) -> None:
         """Tell the state the date of the certificate of the reference in use. `utc_ns` is the UTC of `day`."""

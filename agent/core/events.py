@@ -201,9 +201,9 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     is empty where the motion has no band that is wide enough to tell it.
 
     If a parameter is not determined, its value and uncertainty are those of the prior. At a temperature T the offset is
-    Q + sum of offset_temperature[k - 1] (T - T0)^k over k = 1.., T0 = reference_temperature_degc, and row i of S is
-    multiplied by 1 + sensitivity_temperature[i] (T - T0). Data exist only from temperature_low_degc to
-    temperature_high_degc.
+    Q + sum of offset_temperature[k - 1] (T - T0)^k over k = 1.., T0 = reference_temperature_degc, and the sensitivity
+    S + sensitivity_per_k (T - T0). In results of engines before 13, row i of S is multiplied by
+    1 + sensitivity_temperature[i] (T - T0) instead. Data exist only from temperature_low_degc to temperature_high_degc.
     """
 
     what: ClassVar[str] = "calibration"
@@ -225,8 +225,10 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     temperature_high_degc: float = float("nan")
     offset_temperature: list[list[float]] = []  # (order, 3), output unit per K^k
     u_offset_temperature: list[list[float]] = []
-    sensitivity_temperature: list[float] = []  # (3,) per K; empty if the model has no such term
+    sensitivity_temperature: list[float] = []  # (3,) per K; only of engines before 13
     u_sensitivity_temperature: list[float] = []
+    sensitivity_per_k: list[list[float]] = []  # (3, 3); empty if the model has no such term, or no temperature is told
+    u_sensitivity_per_k: list[list[float]] = []
     offset_rate: list[float] = []  # (3,) output unit per day
     u_offset_rate: list[float] = []
     # Identities of the references to whose errors S and Q owe their values; that of the newest window is the last.

@@ -22,8 +22,13 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array
 
 # Standard uncertainty with which an unknown is set free, by its unit: beyond what a mistake would hardly reach.
-FREE: Mapping[str, float] = {"rad": 0.2, "1": 0.2, "s": 0.02, "m/s2": 2.0, "Hz": 1.0}
-UNITS: Mapping[str, tuple[str, float]] = {"rad": ("deg", 180.0 / np.pi), "1": ("%", 100.0), "s": ("ms", 1e3)}
+FREE: Mapping[str, float] = {"rad": 0.2, "1": 0.2, "s": 0.02, "m/s2": 2.0, "Hz": 1.0, "1/K": 2e-3}
+UNITS: Mapping[str, tuple[str, float]] = {
+    "rad": ("deg", 180.0 / np.pi),
+    "1": ("%", 100.0),
+    "s": ("ms", 1e3),
+    "1/K": ("%/K", 100.0),
+}
 WORTH = 3.0  # an explanation that makes chi-squared smaller by less explains nothing
 
 ACCEPT = (

@@ -21,7 +21,7 @@ from agent.core.events import (
     WindowReport,
 )
 from calib.estimate.drift import DriftVerdict
-from calib.estimate.quantities import MAIN_TEMPERATURE, RATES, offset_temperature
+from calib.estimate.quantities import RATES, SENSITIVITY_PER_K, offset_temperature
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import ResponseTold
 from calib.estimate.sources import Sources
@@ -56,7 +56,8 @@ def calibration_update(
     """
     powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in state.names]
     by_power = [_both(state, offset_temperature(k)) for k in powers]
-    S_temperature = _both(state, MAIN_TEMPERATURE) if MAIN_TEMPERATURE[0] in state.names else ([], [])
+    rows = [SENSITIVITY_PER_K[k : k + 3] for k in range(0, 9, 3)] if SENSITIVITY_PER_K[0] in state.names else []
+    by_row = [_both(state, row) for row in rows]
     rate, u_rate = _both(state, RATES)
     low, high = state.temperature_range_degc
     return CalibrationUpdate(
@@ -69,7 +70,7 @@ def calibration_update(
         reference_temperature_degc=state.reference_temperature_degc,
         temperature_low_degc=low, temperature_high_degc=high,
         offset_temperature=[value for value, _ in by_power], u_offset_temperature=[u for _, u in by_power],
-        sensitivity_temperature=S_temperature[0], u_sensitivity_temperature=S_temperature[1],
+        sensitivity_per_k=[value for value, _ in by_row], u_sensitivity_per_k=[u for _, u in by_row],
         offset_rate=rate, u_offset_rate=u_rate, references=[name for name in state.references if name],
         reference_frequency_hz=state.reference_frequency_hz, **_over_frequency(state.response_told),
         shared_errors=_shared_errors(shares, certificate_of),
@@ -175,6 +176,6 @@ def status_change(source: Source, status: str, before: str, reason: str) -> Stat
     )  # fmt: skip
 
 
-def _both(state: State, names: tuple[str, str, str]) -> tuple[list[float], list[float]]:
+def _both(state: State, names: Sequence[str]) -> tuple[list[float], list[float]]:
     found: Array = np.array([state.quantity(name) for name in names])
     return found[:, 0].tolist(), found[:, 1].tolist()

@@ -137,7 +137,9 @@ def acceleration(values: Array, calibration: CalibrationUpdate, degc: float | No
         above = degc - calibration.reference_temperature_degc
         for k, coefficient in enumerate(calibration.offset_temperature, start=1):
             Q = Q + np.array(coefficient) * above**k
-        if calibration.sensitivity_temperature:
+        if calibration.sensitivity_per_k:
+            S = S + np.array(calibration.sensitivity_per_k) * above
+        if calibration.sensitivity_temperature:  # of an engine before 13
             S = S * (1.0 + np.array(calibration.sensitivity_temperature) * above)[:, None]
     try:
         return np.asarray(np.linalg.solve(S, (values - Q).T).T)

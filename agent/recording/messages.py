@@ -50,7 +50,7 @@ _EVENT_FIELDS: dict[type[Any], str] = {
 _EVENT_KINDS = {field: kind for kind, field in _EVENT_FIELDS.items()}
 _S_AND_Q = [name.lower() for name in PARAMETERS]
 _U = [f"u_{name}" for name in _S_AND_Q]
-_BY_POWER = ["offset_temperature", "u_offset_temperature"]
+_ROWS_OF_THREE = ["offset_temperature", "u_offset_temperature", "sensitivity_per_k", "u_sensitivity_per_k"]
 _BY_AXIS = ["sensitivity_temperature", "u_sensitivity_temperature", "offset_rate", "u_offset_rate"]
 _LISTED = ["determined", "references", "valid_band_hz", "degrees_of_freedom", *_BY_AXIS]
 _BY_UNKNOWN = ["derivative", "own_derivative"]
@@ -183,7 +183,7 @@ def _calibration_message(event_sequence: int, update: CalibrationUpdate) -> pb.C
     values |= zip(_S_AND_Q, s_and_q, strict=True)
     values |= zip(_U, values.pop("standard_uncertainty"), strict=True)
     values |= zip(_RESIDUALS, values.pop("residual_sd"), strict=True)
-    values |= {name: np.ravel(values[name]) for name in _BY_POWER}
+    values |= {name: np.ravel(values[name]) for name in _ROWS_OF_THREE}
     values["sensitivity_at_0hz"] = pb.Calibration.Steady(**_flat(values["sensitivity_at_0hz"]))
     values["response"] = [pb.Calibration.Band(**_flat(band)) for band in values["response"]]
     values["shared_errors"] = [_shared_message(error) for error in values["shared_errors"]]
@@ -201,7 +201,7 @@ def _decode_calibration(data: bytes) -> tuple[int, Result]:
     values["standard_uncertainty"] = [values.pop(name) for name in _U]
     values["residual_sd"] = [values.pop(name) for name in _RESIDUALS]
     values["covariance"] = np.array(values["covariance"]).reshape(12, 12).tolist()
-    values |= {name: np.reshape(values[name], (-1, 3)).tolist() for name in _BY_POWER}
+    values |= {name: np.reshape(values[name], (-1, 3)).tolist() for name in _ROWS_OF_THREE}
     values |= {name: list(values[name]) for name in _LISTED}
     values["budget"] = {source.name: list(source.standard_uncertainty) for source in values["budget"]}
     values["response"] = [_square(band) for band in values["response"]]

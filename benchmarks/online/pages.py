@@ -23,6 +23,7 @@ from benchmarks.online import (
     harm,
     lorries,
     references,
+    temperature,
     touched,
     year,
 )
@@ -160,6 +161,11 @@ def _references(workers: int, runs: int | None) -> tuple[Path, str]:
     return ONLINE, references.table([(name, spread(references.one, own, workers)) for name, own in jobs.items()])
 
 
+def _temperature(workers: int, runs: int | None) -> tuple[Path, str]:
+    lines = temperature.jobs(runs or temperature.RUNS)
+    return ONLINE, temperature.table([spread(temperature.one, own, workers) for own in lines])
+
+
 def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
     return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
 
@@ -177,6 +183,7 @@ PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
     "bridge": _bridge,
     "drift": _drift,
     "references": _references,
+    "temperature": _temperature,
     "day": _day,
     "cost": _cost,
 }

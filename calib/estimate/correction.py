@@ -19,17 +19,17 @@ from calib.model import Array, Calibration
 class Law:
     """S and Q as functions of the temperature T, with their joint covariance.
 
-    Q(T) = Q + sum_k c_k (T - T0)^k; row i of S is multiplied by 1 + d_i (T - T0); T0 = `reference_degc`. `mean` is
-    [S row by row, Q, c_1 (3), .. c_K (3), d (3) if `rows`], `covariance` its covariance, K = `order`. The data cover
-    the range from `low_degc` to `high_degc` (NaN if there are none). Outside the range, `u_beyond` (output unit per K2)
-    times the squared distance from the range is combined with u(Q), for a power that the data cannot show.
-    `determined` (12,) as in calib.model.Calibration.
+    Q(T) = Q + sum_k c_k (T - T0)^k; S(T) = S + C (T - T0); T0 = `reference_degc`. `mean` is [S row by row, Q, c_1 (3),
+    .. c_K (3), C (9) if `varies`], `covariance` its covariance, K = `order`. The data cover the range from `low_degc`
+    to `high_degc` (NaN if there are none). Outside it, `u_beyond` (output unit per K2) times the squared distance
+    from it is combined with u(Q), for a power that the data cannot show. `determined` (12,) as in
+    calib.model.Calibration.
     """
 
     mean: Array
     covariance: Array
     order: int = 0
-    rows: bool = False
+    varies: bool = False
     reference_degc: float = 20.0
     low_degc: float = np.nan
     high_degc: float = np.nan
@@ -71,11 +71,10 @@ class Law:
             at = 12 + 3 * k + np.arange(3)
             map_[range(9, 12), at] = above ** (k + 1)
             value[9:] += self.mean[at] * above ** (k + 1)
-        if self.rows:
-            at = np.repeat(12 + 3 * self.order + np.arange(3), 3)
-            map_[range(9), range(9)] = 1.0 + self.mean[at] * above
-            map_[range(9), at] = self.mean[:9] * above
-            value[:9] *= 1.0 + self.mean[at] * above
+        if self.varies:
+            at = 12 + 3 * self.order + np.arange(9)
+            map_[range(9), at] = above
+            value[:9] += self.mean[at] * above
         return map_, value
 
 

@@ -143,14 +143,15 @@ class Now:
         return np.asarray(rows[np.abs(rows[:, :-1]).max(axis=1, initial=0.0) > 0.0])
 
     def under_gravity(self, record: Record) -> tuple[Array, Array]:
-        """(3,) the part of the mean output that is not Q, in the pose of a record, and its derivatives (3, N)."""
+        """(3,) the part of the mean output that is not Q, in the pose of a record, and its derivatives (3, N); at the
+        temperature of S and Q."""
         s = self.unknowns.statements
         p = s.of(record.reference)
         windows = Windows(
             Stack.of([record], fixed=False), s.temperature.reference_degc,
             at_hz=p.reference_frequency_hz, share=p.reference_share, known_size=p.known_size,
         )  # fmt: skip
-        effect, taken_out = self.unknowns.effect(record, self.day)
+        effect, taken_out = self.unknowns.effect(record, self.day, at_zero=True)
         inputs = effect @ (self.mean - taken_out)
         live = np.flatnonzero(effect.any(axis=1))
         moved = inputs + 1j * STEP * np.eye(SIZE)[live]

@@ -1,6 +1,6 @@
 """V = S a + Q (Eq. 8) as it shows in a window: slopes and means as one function of some fifty inputs.
 
-For output axis i, with the row S_i of S at the temperature of the window,
+For output axis i, with the row S_i of S,
 
     a(t)            D u(t - lag) + R q u'(t) / omega + G,   D = R (D0 + t L) / (1 + r),   G = R' G0 (1 + dg / |G0|)
     slope on u      S_i D (1 - lag^2 omega^2 / 2)
@@ -13,9 +13,9 @@ frequency, S0 that at 0 Hz, for gravity and means. What the front end leaves of 
 it adds to the slopes, and to ln(S0 / S), linearly. Were its square in the equations, terms that no motion tells would
 go where noise makes the square small.
 
-Each unknown acts on the inputs linearly (calib.estimate.unknowns). So the derivative by the unknowns is the one by the
-inputs times a constant matrix for each window, and the one by the inputs comes from a complex step: none is written by
-hand.
+Each unknown acts on the inputs linearly (calib.estimate.unknowns); S and r are those at the temperature of the window.
+So the derivative by the unknowns is the one by the inputs times a constant matrix for each window, and the one by the
+inputs comes from a complex step: none is written by hand.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from calib.signal.response import by_term
 STEP = 1e-30  # of the complex step: its square is lost beside 1, so that the derivative is exact
 AT_ONCE = 1000  # windows times inputs whose derivatives are found together: some 3 MB
 _PARTS = {
-    "S": 9, "Q": 3, "STRETCH": 3, "TURN": 3, "TURN_GRAVITY": 3, "ACROSS": 3, "AHEAD": 3, "LAG": 3, "CORNER": 1,
+    "S": 9, "Q": 3, "TURN": 3, "TURN_GRAVITY": 3, "ACROSS": 3, "AHEAD": 3, "LAG": 3, "CORNER": 1,
     "GRAVITY": 1, "REFERENCE": 3, "RESPONSE": TERMS, "OVER_T": 6,
 }  # fmt: skip
 _ENDS = np.cumsum([0, *_PARTS.values()]).tolist()
 (
-    S, Q, STRETCH, TURN, TURN_GRAVITY, ACROSS, AHEAD, LAG, CORNER, GRAVITY, REFERENCE, RESPONSE, OVER_T
+    S, Q, TURN, TURN_GRAVITY, ACROSS, AHEAD, LAG, CORNER, GRAVITY, REFERENCE, RESPONSE, OVER_T
 ) = (slice(first, stop) for first, stop in pairwise(_ENDS))  # fmt: skip
 SIZE = _ENDS[-1]  # of the inputs
 
@@ -116,7 +116,6 @@ class Windows:
         self.known = np.array(np.isfinite(stack.gravity_mps2).all(axis=1), dtype=bool)
         self.gravity = np.where(self.known[:, None], stack.gravity_mps2, 0.0)
         self.told_degc = np.array(np.isfinite(stack.temperature_degc), dtype=bool)
-        self.over_zero = np.where(self.told_degc, stack.temperature_degc - zero_degc, 0.0)
         self.over_t = _about(stack.over_t, np.where(self.told_degc, zero_degc, 0.0))
         omega = np.sqrt(stack.omega2)
         self.per_omega = np.divide(1.0, omega, out=np.zeros_like(omega), where=omega > 0.0)
@@ -132,8 +131,7 @@ class Windows:
 
     def predicted(self, p: Array) -> tuple[Array, Array]:
         """Slopes R b (..., W, 2M, 3) and means (..., W, k, 3) for inputs (..., W, SIZE)."""
-        stretch = (1.0 + p[..., STRETCH] * self.over_zero[:, None]) * np.exp(-self.removed)[:, None]
-        s = p[..., S].reshape(*p.shape[:-1], 3, 3) * stretch[..., None]
+        s = p[..., S].reshape(*p.shape[:-1], 3, 3) * np.exp(-self.removed)[:, None, None]
         left = p[..., RESPONSE] @ self.at_hz  # of ln |h| at the reference frequency
         at_0hz = s * (1.0 - left)[..., None, None]
         direction, ahead = self._motion(p)
@@ -146,7 +144,7 @@ class Windows:
         return slopes, self.over_t @ over
 
     def under_gravity(self, p: Array) -> Array:
-        """(..., W, 3) the part of the mean of V that is not Q, at the temperature of S and Q."""
+        """(..., W, 3) the part of the mean of V that is not Q."""
         s = p[..., S].reshape(*p.shape[:-1], 3, 3) * np.exp(-self.removed)[:, None, None]
         at_0hz = s * (1.0 - p[..., RESPONSE] @ self.at_hz)[..., None, None]
         return self._under_gravity(p, at_0hz, *self._motion(p))

@@ -7,7 +7,7 @@ decides anything by the name of an unknown: names are for people and for looking
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -86,6 +86,8 @@ class Kind:
     nobody states how alike two references in one place are, so S owes its direction to the first of them.
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
     `stated`: the prior is a statement that the data may contradict; if false, only the data determine the value.
+    `per_k`: its effect is multiplied by the temperature of a window "above" that of S and Q, or by how far the body of
+    the sensor is "behind" it (calib.estimate.record.Record.behind_k).
     `since_certificate`: it grows from the date of the reference's certificate on, without a limit. `prior` is then its
     standard uncertainty after one year; a state begins with that of the time since this date (calib.estimate.unknowns).
     """
@@ -102,6 +104,7 @@ class Kind:
     of_place: bool = False
     straight: float = STRAIGHT
     stated: bool = True
+    per_k: Literal["", "above", "behind"] = ""
     since_certificate: bool = False
     walked_source: str = ""
 
@@ -199,8 +202,17 @@ OFFSET_RATE = Kind(
 )
 # Comes into a state only when a drift of S was found, with the standard uncertainty that this drift has.
 SENSITIVITY_RATE = Kind("sensitivity rate", source=OFFSET_RATE.source, in_output_unit=True, straight=LINEAR)
-SENSITIVITY_TEMPERATURE = Kind("sensitivity over temperature", source=TEMPERATURE)
+SENSITIVITY_TEMPERATURE = Kind(
+    "sensitivity over temperature",
+    source=TEMPERATURE,
+    in_output_unit=True,
+    straight=0.1 * STRAIGHT,  # at 10 K that of S itself
+    per_k="above",
+)
+# What depends on temperature follows the body of sensor and reference, and the thermometer of a chip is ahead of it.
+SENSITIVITY_BEHIND = replace(SENSITIVITY_TEMPERATURE, name="sensitivity behind temperature", per_k="behind")
 OFFSET_TEMPERATURE = Kind("offset over temperature", source=TEMPERATURE, straight=LINEAR)
+OFFSET_BEHIND = Kind("offset behind temperature", source=TEMPERATURE, straight=LINEAR, per_k="behind")
 SENSOR_CORNER = Kind(
     "sensor corner", "Hz", "corner frequency",
     prior=Statement("sensor_corner_hz", 0.0, ("prior.u_corner_hz",), option="u_sensor_corner_hz"),
@@ -292,6 +304,11 @@ REFERENCE_DRIFT = Kind(  # beside the constant error of the certificate, whose p
     walk=Statement("reference_drift", 0.0, ("certificate.stability_pct",), convert=_percent_a_year),
     of_reference=True, since_certificate=True,
 )  # fmt: skip
+REFERENCE_TEMPERATURE = Kind(  # its certificate holds at the temperature of S and Q
+    "reference over temperature", "1/K", "reference over temperature",
+    prior=Statement("reference_per_k", 0.0, ("certificate.u_sensitivity_pct_per_k",), convert=_percent),
+    of_reference=True, per_k="above", straight=0.1 * STRAIGHT,
+)  # fmt: skip
 REFERENCE_CORNER = Kind(
     "reference corner", "Hz", "corner frequency",
     prior=Statement("reference_corner_hz", 0.0, ("certificate.u_corner_hz",), option="u_reference_corner_hz"),
@@ -326,7 +343,10 @@ BETWEEN_WINDOWS = (
     Statement("offset_mps2", 0.05, ("uncertainty.offset_mps2",), option="u_offset_mps2"),
     Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # the data may show a larger one
 )
-OF_SENSOR = (SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE, SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE)
+OF_SENSOR = (
+    SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE,
+    SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE, SENSITIVITY_BEHIND, OFFSET_BEHIND,
+)  # fmt: skip
 FREQUENCIES = (
     Statement("response_hz"),  # to which the terms of the response are scaled
     Statement("response_from_hz"),  # to which those below the motion are scaled
@@ -345,7 +365,8 @@ WALKS = by_name([s for k in OF_SENSOR for s in k.statements] + [k.walk for k in 
 S_AND_Q = tuple(Quantity(name, SENSITIVITY if k < 9 else OFFSET) for k, name in enumerate(PARAMETERS))
 RATES = ("Qx_rate", "Qy_rate", "Qz_rate")  # output unit a day; every state has them
 ALL_RATES = (*(f"{name}_rate" for name in PARAMETERS[:9]), *RATES)  # of S and Q, in the order of PARAMETERS
-MAIN_TEMPERATURE = ("Sx_T1", "Sy_T1", "Sz_T1")  # of a row of S, relative per K
+SENSITIVITY_PER_K = tuple(f"{name}_T1" for name in PARAMETERS[:9])  # output unit per m/s2 and K
+BEHIND = tuple(f"{name}_behind" for name in PARAMETERS)  # of S and Q, for each kelvin of `behind_k`
 
 
 def offset_temperature(power: int) -> tuple[str, str, str]:

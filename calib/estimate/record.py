@@ -44,8 +44,9 @@ class Record:
     `scores` (2, LEVELS, SUMS): what tells how much slopes and means scatter (calib.estimate.type_a.score_sums).
 
     Means: of the reference `mean_x` (2M,), of V `means` (k, 3), each a sum over (1, T, T^2) with the weights `over_t`
-    (k, 3), T in K above 0 degC; one row for one window. `temperature_degc`: NaN where nothing told it. `held_mps2`
-    (3,): mean input acceleration by the pose as stated, NaN where nobody stated gravity. `count`: samples.
+    (k, 3), T in K above 0 degC; one row for one window. `temperature_degc`: NaN where nothing told it; `behind_k`: by
+    how much its mean over the last hour is above it, as that of a body that follows it late. `held_mps2` (3,): mean
+    input acceleration by the pose as stated, NaN where nobody stated gravity. `count`: samples.
 
     Response: `told` (r, TERMS + 1): rows of its terms alone; `deviations` and `left_open`: what the bands say beside.
     `motion_hz`: the band of the motion that lasts, also where less of it was used; None where it tells no response.
@@ -90,6 +91,7 @@ class Record:
     mean_hz: float
     motion: Motion | None = None
     to_hz: float = np.inf
+    behind_k: float = 0.0
     bands: BandSums | None = None
     reference_noise: Array | None = None
 
@@ -166,7 +168,7 @@ class Record:
             reference_noise=self._noise_within(bands), bands=bands, response=self.response, motion_hz=self.motion_hz,
         )  # fmt: skip
         made = Record.of(window, self.day, self.lag_s, self.temperature_degc, self.reference, to_hz)
-        return replace(made, mean_x=self.mean_x, to_hz=to_hz, scores=self.scores)
+        return replace(made, mean_x=self.mean_x, to_hz=to_hz, scores=self.scores, behind_k=self.behind_k)
 
     def _noise_within(self, bands: BandSums) -> Array | None:
         """(2, M) rms of the reference's noise in points of these bands, the first ones of all: its density is even."""
@@ -196,10 +198,15 @@ class Record:
         means = 3 * len(self.means) if np.isfinite(self.held_mps2).all() else 0
         return 3 * int(np.count_nonzero(np.diag(self.root))) + means
 
+    @property
+    def tells_temperature(self) -> bool:
+        """Whether its temperature is known."""
+        return bool(np.isfinite(self.temperature_degc))
+
     @cached_property
     def setting(self) -> tuple[object, ...]:
         """Records with the same setting have the same unknowns, with the same effects."""
-        return (*self.pose.setting, self.reference, self.channels)
+        return (*self.pose.setting, self.reference, self.channels, self.tells_temperature)
 
     @cached_property
     def loadings(self) -> Array:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from calib.estimate.estimate import Now
-from calib.estimate.quantities import REFERENCE, REFERENCE_CORNER, REFERENCE_DRIFT
+from calib.estimate.quantities import REFERENCE, REFERENCE_CORNER, REFERENCE_DRIFT, REFERENCE_TEMPERATURE
 from calib.estimate.solution import Solution
 from calib.estimate.unknowns import EXACT
 from calib.model import Array
@@ -24,6 +24,7 @@ SHARED = (
     REFERENCE,
     REFERENCE_DRIFT,
     REFERENCE_CORNER,
+    REFERENCE_TEMPERATURE,
 )  # lag, response and rotation are of both instruments or the mount
 
 

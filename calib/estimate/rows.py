@@ -10,7 +10,14 @@ import numpy as np
 
 from calib.estimate import physics
 from calib.estimate.physics import Stack, Windows
-from calib.estimate.quantities import REFERENCE_DRIFT, TEMPERATURE, WALK, YEAR_DAYS, offset_temperature
+from calib.estimate.quantities import (
+    REFERENCE_DRIFT,
+    SENSITIVITY_PER_K,
+    TEMPERATURE,
+    WALK,
+    YEAR_DAYS,
+    offset_temperature,
+)
 from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
 from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
@@ -66,10 +73,11 @@ def _beside_white(found: Scattered | None) -> float:
 @dataclass(frozen=True, slots=True)
 class Degrees:
     """What a window without a temperature may have had: the lowest and highest temperature that any had, over the one
-    to which S and Q refer, and the coefficients (2, 3) of Q, by power."""
+    to which S and Q refer, the coefficients (2, 3) of Q, by power, and those (3, 3) of S."""
 
     ends_k: tuple[float, float]
     coefficients: Array
+    of_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     @classmethod
     def of(cls, unknowns: Unknowns, seen_degc: tuple[float, float], x: Array) -> Degrees:
@@ -79,8 +87,19 @@ class Degrees:
             for i, name in enumerate(offset_temperature(power)):
                 if (k := unknowns.at.get(name)) is not None:
                     found[power - 1, i] = x[k]
+        of_S = np.array([x[unknowns.at[name]] if name in unknowns.at else 0.0 for name in SENSITIVITY_PER_K])
         low, high = (end - zero if np.isfinite(end) else 0.0 for end in seen_degc)
-        return cls((low, high), found)
+        return cls((low, high), found, of_S.reshape(3, 3))
+
+    def moved(self, told_degc: Array, by_S: Array) -> Array:
+        """(W, 6M, n) what the slopes of windows scatter, of which `by_S` (W, 2M, 3, 3) are the derivatives of each axis
+        by its row of S; n is 1 where a window had no temperature and S depends on it, else 0."""
+        w, m = by_S.shape[:2]
+        if told_degc.all() or not self.of_sensitivity.any():
+            return np.zeros((w, 3 * m, 0))
+        size = float(np.sqrt(np.mean(np.square(self.ends_k))))
+        moved = size * np.einsum("wmij,ij->wmi", by_S, self.of_sensitivity)
+        return np.asarray(np.where(told_degc[:, None, None], 0.0, moved).reshape(w, 3 * m, 1))
 
     @property
     def covariance(self) -> Array:
@@ -115,7 +134,10 @@ class Rows:
             windows = Windows(stack, degc, nominal, held, at_hz=hz, share=share, known_size=size)
             pairs = [unknowns.effect(records[w], float(epoch_day[w])) for w in at]
             effect, taken_out = np.array([e for e, _ in pairs]), np.array([a for _, a in pairs])
-            slopes, means = _Slopes(own, windows, unknowns, noise), _Means(own, windows, unknowns, noise, degrees)
+            slopes, means = (
+                _Slopes(own, windows, unknowns, noise, degrees),
+                _Means(own, windows, unknowns, noise, degrees),
+            )
             by_bands = _told(own) if told else None
             self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, by_bands))
 
@@ -189,7 +211,9 @@ def _told(records: Sequence[Record]) -> Array:
 class _Slopes:
     """By what the slopes of W windows are multiplied, so that their covariance is one: `weights` (W, 6M, 6M)."""
 
-    def __init__(self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise) -> None:
+    def __init__(
+        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise, degrees: Degrees
+    ) -> None:
         s, n, own = unknowns.statements, 6 * windows.channels, windows.stack
         merged, self._stretch = _merged(records)
         priors = [s.of(r.reference) for r in records]
@@ -202,6 +226,8 @@ class _Slopes:
         silent = windows.moved @ (np.eye(3) - own.excited)
         self._missed = (np.sqrt(silent**2 @ unknown.T**2) / own.noise[:, None]).reshape(len(records), n)
         walks = np.sqrt(unknowns.a_day[[0, 4, 8]])
+        by_S = windows.moved[:, :, None, :] / own.noise[:, None, :, None]
+        self._degrees = degrees.moved(windows.told_degc, by_S)
         self._walked = windows.moved[:, :, None, :] * walks[:, None] / own.noise[:, None, :, None]
         drifted = np.sqrt(self._stretch / YEAR_DAYS) * [p.of(REFERENCE_DRIFT.prior) for p in priors]
         by_channel = _by_channel(windows).reshape(len(records), n, own_channels(windows.channels))
@@ -213,7 +239,7 @@ class _Slopes:
         """(W, 6M, 6M) that of the root of the covariance, in units of the noise of a point."""
         one = np.eye(self._missed.shape[1])
         covariance = self._white[:, None, None] * one + self._missed[..., None] ** 2 * one
-        covariance = covariance + self._loaded @ self._loaded.mT
+        covariance = covariance + self._loaded @ self._loaded.mT + self._degrees @ self._degrees.mT
         if self._stretch.any():
             for i in range(3):
                 each = self._walked[:, :, i]
@@ -226,11 +252,13 @@ class _Slopes:
         moved = (self.weights.mT @ gains) * self._noise[..., None]
         by_load = (self._loaded.mT @ moved) ** 2
         by_walk = sum(((self._walked[:, :, i].mT @ moved[:, i::3]) ** 2).sum(axis=1) for i in range(3))
-        return {
+        shares = {
             TYPE_A: np.einsum("w,wrm->m", self._white, moved**2), LAGS: by_load[:, 0].sum(axis=0),
             CORRECTION: by_load[:, 1].sum(axis=0), UNSEEN: ((self._missed[..., None] * moved) ** 2).sum(axis=(0, 1)),
             WALK: self._stretch @ by_walk, REFERENCE_DRIFT.source: ((self._drifted.mT @ moved) ** 2).sum(axis=(0, 1)),
         }  # fmt: skip
+        by_degrees = ((self._degrees.mT @ moved) ** 2).sum(axis=(0, 1))
+        return shares | ({TEMPERATURE: by_degrees} if self._degrees.size else {})
 
 
 def _by_channel(windows: Windows) -> Array:

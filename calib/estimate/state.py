@@ -23,7 +23,17 @@ from calib.estimate.never_turned import never_turned
 from calib.estimate.nuisances import Priors
 from calib.estimate.over_frequency import SEVERAL, OverFrequency, changed
 from calib.estimate.past import Change, Past, epoch_days
-from calib.estimate.quantities import ALL_RATES, KINDS, LAG, PRIORS, S_AND_Q, Quantity
+from calib.estimate.quantities import (
+    ALL_RATES,
+    KINDS,
+    LAG,
+    OFFSET_TEMPERATURE,
+    PRIORS,
+    S_AND_Q,
+    SENSITIVITY_PER_K,
+    Quantity,
+    offset_temperature,
+)
 from calib.estimate.record import Record, together
 from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
@@ -37,6 +47,7 @@ from calib.model import Array, Calibration, scale_of
 from calib.signal.response import Response
 
 DATED = ", calibrated "  # in the identity of a reference whose certificate states its date
+BODY_DAYS = 1.0 / 24.0  # the time by which the body of a sensor and its reference may be behind a thermometer
 STEADY = np.zeros(12)  # rates of S and Q
 METHOD = "3 (recursive adjustment)"
 MOST_POSITIONS, MOST_REFERENCES = 48, 8  # whose records are kept
@@ -86,6 +97,8 @@ class State:
     ) -> None:
         self._mean, self._u = np.array(mean, dtype=float), np.array(standard_uncertainty, dtype=float)
         self._priors, self._wander, self._temperature = [priors, *check], wander, temperature
+        self._body: tuple[float, float] | None = None  # the day, and the temperature that a slow body has then
+        self._zero_degc: float | None = None  # of S and Q, where the first window settles it
         self._fixed, self._place = fixed, 0
         self.scale = scale_of(self._mean)
         self._present = [""] * len(self._priors)  # the references by place
@@ -117,9 +130,16 @@ class State:
         certified = {r: met.certified_day for r, met in self._met.items() if met.certified_day is not None}
         places = {reference: met.place for reference, met in self._met.items()}
         return Statements(
-            self._mean, self._u, priors, self._wander, self._temperature, places, certified, tuple(self._steps),
+            self._mean, self._u, priors, self._wander, self._over_temperature, places, certified, tuple(self._steps),
             tuple(self._widened), tuple(self._dated), self._held_mps2 if self._mean_is_held else None,
         )  # fmt: skip
+
+    @property
+    def _over_temperature(self) -> TemperatureModel:
+        """What is stated of the dependence on temperature, about the temperature that the first window settled."""
+        if not self._temperature.settles or self._zero_degc is None:
+            return self._temperature
+        return replace(self._temperature, reference_degc=self._zero_degc)
 
     def estimate(self, noise: Noise | None = None, also: Sequence[float] = ()) -> Estimate:
         """The whole solved anew, the past as well; `noise`: None pools that of the records. `also`: further epochs."""
@@ -127,6 +147,14 @@ class State:
         days += [step.day for step in self._steps if days and step.day > days[0]]
         start = self._now if self._records else None
         return estimate(self._records, self.statements, start=start, also=[*days, *also], noise=noise)
+
+    def with_body(self, record: Record) -> Record:
+        """A window with the temperature of a body that follows the told one late (Record.behind_k)."""
+        if self._body is None or not record.tells_temperature:
+            return record
+        day, degc = self._body
+        kept = float(np.exp(-abs(record.day - day) / BODY_DAYS))
+        return replace(record, behind_k=kept * (degc - record.temperature_degc))
 
     @property
     def reference(self) -> str:
@@ -268,7 +296,18 @@ class State:
             more, by = under_gravity
             mean[9:12] -= more
             factor[9:12] -= by @ factor
+            if self._varies(now):  # the first power of the mean output contains that of S
+                own, of_S = (
+                    [now.index(name) for name in names] for names in (offset_temperature(1), SENSITIVITY_PER_K)
+                )
+                mean[own] -= by[:, :9] @ mean[of_S]
+                factor[own] -= by[:, :9] @ factor[of_S]
         return mean, factor
+
+    @staticmethod
+    def _varies(now: Now) -> bool:
+        """Whether S is estimated as a function of the temperature."""
+        return SENSITIVITY_PER_K[0] in now
 
     def _under_gravity(self, now: Now) -> tuple[Array, Array] | None:
         """By what the mean output of a fixed mount is more than Q (3,), with the derivatives (3, N); None of another
@@ -292,13 +331,24 @@ class State:
         return self._law(self._now, *self._values())
 
     def _law(self, now: Now, mean: Array, factor: Array) -> Law:
-        temperature = self._temperature
-        order, rows = temperature.offset_order, temperature.sensitivity_order > 0
-        chosen = [*range(12), *(now.index(quantity.key) for quantity, _ in temperature.terms(self.scale))]
+        temperature = self._over_temperature
+        of_S = temperature.of_sensitivity(self.scale) if self._varies(now) else []
+        own = [quantity.key for quantity, _ in (*temperature.of_offset(self.scale), *of_S)]
+        chosen = [*range(12), *map(now.index, own)]
         mean, factor = mean[chosen], factor[chosen]
         covariance, (low, high) = factor @ factor.T, self.temperature_range_degc
         told, u_beyond = self._determined(mean[:12], covariance[:12, :12]), temperature.u_offset_mps2[1] * self.scale
-        return Law(mean, covariance, order, rows, self.reference_temperature_degc, low, high, u_beyond, told)
+        return Law(
+            mean,
+            covariance,
+            temperature.offset_order,
+            bool(of_S),
+            temperature.reference_degc,
+            low,
+            high,
+            u_beyond,
+            told,
+        )
 
     @property
     def _moving_steps(self) -> list[Step]:
@@ -350,7 +400,10 @@ class State:
         quantity = now.unknowns.all[own[0]].quantity
         if quantity.kind.since_certificate:  # the value at the beginning, and the walk since then
             own.append(now.index(replace(quantity, centre=True).key))
-        return float(now.mean[own].sum()), float(np.linalg.norm(now.factor[own].sum(axis=0)))
+        mean, factor = now.mean, now.factor
+        if quantity.kind is OFFSET_TEMPERATURE and self._varies(now):
+            mean, factor = self._values()
+        return float(mean[own].sum()), float(np.linalg.norm(factor[own].sum(axis=0)))
 
     @property
     def residual_sd(self) -> Array:
@@ -360,7 +413,7 @@ class State:
     @property
     def reference_temperature_degc(self) -> float:
         """To which S and Q refer."""
-        return self._temperature.reference_degc
+        return self._over_temperature.reference_degc
 
     @property
     def quantities(self) -> list[Quantity]:
@@ -464,6 +517,7 @@ class State:
     def update(self, record: Record) -> None:
         """Take a window."""
         self.merge_old(record.day)
+        record = self.with_body(record)
         record, ahead = self._know(record)
         self._take(record, ahead, ahead.rows(self._directed(record)))
 
@@ -510,6 +564,14 @@ class State:
         another = self._use_band(was)
         return another or self._over.at_hz != at_hz or self._over.late_s != was.late_s
 
+    def _settle_temperature(self, record: Record) -> bool:
+        """A window comes: S and Q hold at the temperature of the first that tells one, in whole degrees. Returns
+        whether it is this one."""
+        if not self._temperature.settles or not record.tells_temperature or self._zero_degc is not None:
+            return False
+        self._zero_degc = float(np.round(record.temperature_degc))
+        return True
+
     def _use_band(self, was: OverFrequency) -> bool:
         """Of the records, only the motion within the band stays. Returns whether it is another one than it `was`."""
         if self._over.motion_hz == was.motion_hz:
@@ -522,7 +584,7 @@ class State:
     def _know(self, record: Record) -> tuple[Record, Now]:
         """A window as far as its motion is used, and the state at its time, with the unknowns that no window had
         before."""
-        anew = self._begin(record)
+        anew = self._begin(record) | self._settle_temperature(record)
         record = record.within(self._over.to_hz) or record
         if self._fixed and np.isfinite(record.held_mps2).all():
             if self._held_mps2 is None:
@@ -550,6 +612,8 @@ class State:
         old = [one if one.bands is None else replace(one, bands=None) for one in old]
         self._records = [*old, *new, record]
         self._over = self._over.taken(record)
+        if record.tells_temperature:
+            self._body = record.day, record.temperature_degc + record.behind_k
         self._used = [r for r in self._used if r != record.reference] + [record.reference]
         day = int(np.floor(record.day))
         self._newest_day = day if self._newest_day is None else max(self._newest_day, day)
@@ -718,6 +782,8 @@ class State:
             "over": self._over.snapshot(),
             "held_mps2": self._held_mps2,
             "fixed": self._fixed,
+            "zero_degc": self._zero_degc,
+            "body": None if self._body is None else list(self._body),
             "now": self._now.snapshot(),
             "stated": self._stated(),
             "newest_day": self._newest_day,
@@ -740,6 +806,8 @@ class State:
         self._held_mps2 = None if state["held_mps2"] is None else np.array(state["held_mps2"])
         self._fixed = self._fixed and state["fixed"]  # a mount that turned once is fixed no more
         self._newest_day, self.windows, self._merged_at = state["newest_day"], state["windows"], state["merged_at"]
+        self._zero_degc = state["zero_degc"]
+        self._body = None if (body := state["body"]) is None else (body[0], body[1])
         self._now = Now.load(state["now"], self.statements, self._records)
         self._stated_then = None if state["stated"] == self._stated() else state["stated"]
 

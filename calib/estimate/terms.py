@@ -140,12 +140,11 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Stated, reference: str)
         yield _term("gravity", kinds.GRAVITY, priors, gravity=np.ones(1))
     if channels == 0:
         return
-    real = own_channels(channels)
-    for m in range(real):
-        of = "" if real == 1 else f"_{AXES[m]}"
-        own = np.resize(np.eye(real)[m], channels)
-        yield _term(f"reference{of}", kinds.REFERENCE, priors, owner=reference, reference=own)
-        yield _term(f"reference_drift{of}", kinds.REFERENCE_DRIFT, priors, owner=reference, reference=own)
+    for (name, own), (drift, _) in zip(
+        *(_by_channel(n, channels) for n in ("reference", "reference_drift")), strict=True
+    ):
+        yield _term(name, kinds.REFERENCE, priors, owner=reference, reference=own)
+        yield _term(drift, kinds.REFERENCE_DRIFT, priors, owner=reference, reference=own)
     yield _term("lag", kinds.LAG, priors, reference, lag=np.ones(3))
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
@@ -160,6 +159,19 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Stated, reference: str)
     turn = np.full(1, 2.0 * np.pi)
     yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, reference, reference_corner=turn)
     yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, sensor_corner=turn)
+
+
+def reference_over_temperature(channels: int, priors: Stated, reference: str) -> Iterator[Term]:
+    """By how much each channel of a reference indicates more for each kelvin over the temperature of S and Q."""
+    for name, own in _by_channel("reference_per_k", channels):
+        yield _term(name, kinds.REFERENCE_TEMPERATURE, priors, owner=reference, reference=own)
+
+
+def _by_channel(name: str, channels: int) -> Iterator[tuple[str, Array]]:
+    """Names, and (M,) ones at the channel itself and at its integral."""
+    real = own_channels(channels)
+    for m in range(real):
+        yield f"{name}{'' if real == 1 else f'_{AXES[m]}'}", np.resize(np.eye(real)[m], channels)
 
 
 def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:

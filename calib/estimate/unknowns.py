@@ -13,10 +13,11 @@ from calib.estimate import quantities as kinds
 from calib.estimate.chain import Passage
 from calib.estimate.quantities import (
     ALL_RATES,
-    MAIN_TEMPERATURE,
+    BEHIND,
     OFFSET_RATE,
     RATES,
     S_AND_Q,
+    SENSITIVITY_PER_K,
     SENSITIVITY_RATE,
     YEAR_DAYS,
     Quantity,
@@ -24,7 +25,7 @@ from calib.estimate.quantities import (
 )
 from calib.estimate.record import Record
 from calib.estimate.statements import DOUBT, FLAT, Dated, Statements, Widening
-from calib.estimate.terms import Term, terms
+from calib.estimate.terms import Term, reference_over_temperature, terms
 from calib.model import Array
 
 EXACT = 1e-9  # standard uncertainty, relative to the scale, of what is known exactly
@@ -92,10 +93,18 @@ class Unknowns:
         self._terms[record.setting] = self._terms_of(record)
         self._effects.clear()
         self._taken_out.clear()
-        return self._add(found for t in self._terms[record.setting] for found in self._of_term(t, record))
+        new = self._add(found for t in self._terms[record.setting] for found in self._of_term(t, record))
+        if record.tells_temperature:
+            model = self.statements.temperature
+            of_S, behind = (told(self.statements.scale) for told in (model.of_sensitivity, model.behind))
+            new += self._add(Unknown(quantity, 0.0, u, self.begin) for quantity, u in (*of_S, *behind))
+        return new
 
     def _terms_of(self, record: Record) -> list[Term]:
-        own = terms([record.pose], record.channels, self.statements.of(record.reference), {}, record.reference)
+        stated = self.statements.of(record.reference)
+        own = terms([record.pose], record.channels, stated, {}, record.reference)
+        if record.tells_temperature:
+            own += reference_over_temperature(record.channels, stated, record.reference)
         return [replace(t, quantity=self.placed(t.quantity)) for t in own if t.uncertainty > 0.0]
 
     def with_statements(self, statements: Statements) -> Unknowns:
@@ -155,7 +164,7 @@ class Unknowns:
         for own, rate in zip(unknowns, ALL_RATES, strict=True):
             if own.a_day and np.isfinite(own.bound) and (rate in RATES or stepping & {own.key, rate}):
                 yield Unknown(replace(own.quantity, centre=True), own.mean, EXACT * s.scale, begin)
-        for quantity, u in s.temperature.terms(s.scale):
+        for quantity, u in s.temperature.of_offset(s.scale):
             yield Unknown(quantity, 0.0, u, begin)
 
     def _of_term(self, t: Term, record: Record) -> Iterable[Unknown]:
@@ -258,14 +267,20 @@ class Unknowns:
 
     # --- effects on a window
 
-    def effect(self, record: Record, epoch_day: float) -> tuple[Array, Array]:
+    def effect(self, record: Record, epoch_day: float, *, at_zero: bool = False) -> tuple[Array, Array]:
         """(SIZE, N) of one unit of each unknown on the inputs of a window (calib.estimate.physics), and (N,) what its
-        front end took out, at an epoch that has this day."""
+        front end took out, at an epoch that has this day. `at_zero`: not at the temperature of the window, but at that
+        of S and Q."""
         if record.setting not in self._effects:
             self._effects[record.setting] = self._effect(record)
         effect, away = self._effects[record.setting], record.day - epoch_day
-        if away:
+        per_k = {"above": 0.0 if at_zero else self._above_k(record), "behind": 0.0 if at_zero else record.behind_k}
+        by_temperature = [(k, own.quantity.kind.per_k) for k, own in enumerate(self.all) if own.quantity.kind.per_k]
+        if away or by_temperature:
             effect = effect.copy()
+        for k, which in by_temperature:
+            effect[:, k] *= per_k[which]
+        if away:
             for p, name in enumerate(ALL_RATES):
                 if (rate := self.at.get(name)) is not None:
                     effect[:, rate] += away * effect[:, p]
@@ -273,6 +288,11 @@ class Unknowns:
         if key not in self._taken_out:
             self._taken_out[key] = self._found_taken_out(record)
         return effect, self._taken_out[key]
+
+    def _above_k(self, record: Record) -> float:
+        """The temperature of a window over that of S and Q; 0 where it is not known."""
+        degc = record.temperature_degc
+        return degc - self.statements.temperature.reference_degc if record.tells_temperature else 0.0
 
     def _found_taken_out(self, record: Record) -> Array:
         found, priors = np.zeros(len(self.all)), self.statements.of(record.reference)
@@ -288,7 +308,8 @@ class Unknowns:
     def _effect(self, record: Record) -> Array:
         found = np.zeros((physics.SIZE, len(self.all)))
         found[physics.S, :9], found[physics.Q, 9:12] = np.eye(9), np.eye(3)
-        found[physics.STRETCH] += self._named(MAIN_TEMPERATURE)
+        found[physics.S] += self._named(SENSITIVITY_PER_K) + self._named(BEHIND[:9])
+        found[physics.Q] += self._named(BEHIND[9:])
         found[physics.OVER_T] += np.vstack([self._named(offset_temperature(power)) for power in (1, 2)])
         for t in self._terms[record.setting]:
             (own,) = t.on_inputs(1)

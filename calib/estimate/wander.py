@@ -9,9 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from calib.estimate.quantities import (
-    MAIN_TEMPERATURE,
+    BEHIND,
+    OFFSET_BEHIND,
     OFFSET_TEMPERATURE,
     S_AND_Q,
+    SENSITIVITY_BEHIND,
+    SENSITIVITY_PER_K,
     SENSITIVITY_TEMPERATURE,
     TILT_WALK,
     WALKS,
@@ -50,7 +53,8 @@ class TemperatureModel:
     """Dependence of S and Q on the temperature T, with the standard uncertainties of the coefficients before any data.
 
     Q(T) = Q + sum_k c_k (T - T0)^k, k = 1 .. `offset_order` (0: Q does not depend on T). If `sensitivity_order` is 1,
-    row i of S is multiplied by 1 + d_i (T - T0). T0 is `reference_degc`.
+    S(T) = S + C (T - T0) as soon as a window tells its temperature; `u_sensitivity` is that of each element of C over
+    the main sensitivity. T0 is `reference_degc`; with `settles` only until a window tells its temperature.
     """
 
     offset_order: int = 0
@@ -58,13 +62,24 @@ class TemperatureModel:
     reference_degc: float = 20.0
     u_offset_mps2: tuple[float, float] = (0.01, 2e-4)  # per K, per K2
     u_sensitivity: float = 2e-4  # per K
+    settles: bool = False
 
-    def terms(self, scale: float) -> list[tuple[Quantity, float]]:
-        """Its coefficients, each with its standard uncertainty before any data; `scale` is output unit per m/s2."""
-        found = [
+    def of_offset(self, scale: float) -> list[tuple[Quantity, float]]:
+        """Coefficients of Q, each with its standard uncertainty before any data; `scale` is output unit per m/s2."""
+        return [
             (Quantity(name, OFFSET_TEMPERATURE), u * scale)
             for power, u in enumerate(self.u_offset_mps2[: self.offset_order], start=1)
             for name in offset_temperature(power)
         ]
-        rows = MAIN_TEMPERATURE[: 3 * self.sensitivity_order]
-        return found + [(Quantity(name, SENSITIVITY_TEMPERATURE), self.u_sensitivity) for name in rows]
+
+    def of_sensitivity(self, scale: float) -> list[tuple[Quantity, float]]:
+        """Those of S, row by row."""
+        names = SENSITIVITY_PER_K if self.sensitivity_order else ()
+        return [(Quantity(name, SENSITIVITY_TEMPERATURE), self.u_sensitivity * scale) for name in names]
+
+    def behind(self, scale: float) -> list[tuple[Quantity, float]]:
+        """Those of S and Q for a body that follows the told temperature late; with S alone, as `of_sensitivity`."""
+        if not self.sensitivity_order:
+            return []
+        of_S = [(Quantity(name, SENSITIVITY_BEHIND), self.u_sensitivity * scale) for name in BEHIND[:9]]
+        return of_S + [(Quantity(name, OFFSET_BEHIND), self.u_offset_mps2[0] * scale) for name in BEHIND[9:]]

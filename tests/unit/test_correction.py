@@ -57,16 +57,16 @@ def test_at_rest_s_and_q_know_of_each_other() -> None:
     assert alone.min() > 0.1
 
 
-def test_over_temperature_each_power_and_each_row_has_its_part() -> None:
-    c, d = np.array([[0.01, -0.02, 0.005], [1e-4, 0.0, -1e-4]]), np.array([1e-4, -2e-4, 3e-4])
-    mean = np.concatenate([S.ravel(), Q, c.ravel(), d])
-    law = Law(mean, covariance(3, 21, 1e-4), 2, True, 20.0, 10.0, 30.0, 1e-3)
+def test_over_temperature_each_power_and_each_element_has_its_part() -> None:
+    c, per_k = np.array([[0.01, -0.02, 0.005], [1e-4, 0.0, -1e-4]]), 1e-4 * np.arange(-4.0, 5.0).reshape(3, 3)
+    mean = np.concatenate([S.ravel(), Q, c.ravel(), per_k.ravel()])
+    law = Law(mean, covariance(3, 27, 1e-4), 2, True, 20.0, 10.0, 30.0, 1e-3)
     there = law.at(25.0)
-    np.testing.assert_allclose(there.sensitivity, S * (1 + 5 * d)[:, None], rtol=1e-15)
+    np.testing.assert_allclose(there.sensitivity, S + 5 * per_k, rtol=1e-15)
     np.testing.assert_allclose(there.offset, Q + 5 * c[0] + 25 * c[1], rtol=1e-15)
     # Its covariance by differences: every part moved by itself.
     step, columns = 1e-6, []
-    for k in range(21):
+    for k in range(27):
         moved = mean.copy()
         moved[k] += step
         other = Law(moved, law.covariance, 2, True, 20.0, 10.0, 30.0, 1e-3).at(25.0)

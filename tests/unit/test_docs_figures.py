@@ -39,7 +39,7 @@ ELSEWHERE = {
     "faults": "tests.faults.outcome", "soak-day": "benchmarks.soak", "soak-hour": "benchmarks.soak",
     **{name: f"benchmarks.online.{name}" for name in
        ("agreement", "bench", "chip", "cost", "coverage", "day", "filters", "harm", "lorries",
-        "references", "touched", "year")},
+        "references", "temperature", "touched", "year")},
 }  # fmt: skip
 
 

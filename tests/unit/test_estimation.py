@@ -179,9 +179,10 @@ def test_what_is_accepted_keeps_how_it_goes_with_temperature() -> None:
     answer = found.gate.accept(20, "key")  # not the newest
     assert answer.calibration is not None
     found.accept(answer.calibration)
-    at = found.law.at(28.0)
-    np.testing.assert_allclose(at.sensitivity, answer.calibration.sensitivity, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(at.offset - answer.calibration.offset, 0.16, rtol=0, atol=0.01)
+    at_20, at_28 = found.law.at(20.0), found.law.at(28.0)
+    np.testing.assert_allclose(at_20.sensitivity, answer.calibration.sensitivity, rtol=0, atol=1e-12)
+    output_20, output_28 = (at.sensitivity @ GRAVITY + at.offset for at in (at_20, at_28))
+    np.testing.assert_allclose(output_28 - output_20, 0.16, rtol=0, atol=0.01)
 
 
 def test_of_two_proposals_of_one_step_each_can_be_accepted_by_its_number() -> None:

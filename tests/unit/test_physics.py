@@ -59,9 +59,9 @@ WORLDS = {
         lambda _, u: ((u / (1.0 + np.array([0.01, -0.02, 0.03]))) @ D.T + GRAVITY) @ S_TRUE.T + Q_TRUE,
     ),
     "gravity and temperature": (
-        {"GRAVITY": 0.02, "STRETCH": 1e-3 * np.ones(3), "OVER_T": np.array([0.1, 0.0, -0.1, 0.0, 0.01, 0.0])},
+        {"GRAVITY": 0.02, "OVER_T": np.array([0.1, 0.0, -0.1, 0.0, 0.01, 0.0])},
         lambda _, u: (
-            1.01 * (u @ D.T + GRAVITY * (1.0 + 0.02 / G_MPS2)) @ S_TRUE.T
+            (u @ D.T + GRAVITY * (1.0 + 0.02 / G_MPS2)) @ S_TRUE.T
             + Q_TRUE + np.array([0.1, 0.0, -0.1]) * 10.0 + np.array([0.0, 0.01, 0.0]) * 100.0
         ),
     ),

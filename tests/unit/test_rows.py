@@ -47,7 +47,9 @@ def records(pose: Pose) -> list[Record]:
     told = random.normal(size=(3, len(powers) + 1)) / np.append(units, 1.0)
     own = replace(own, passed=moved, mean_x=0.1 * random.normal(size=own.mean_x.shape), told=told, response=(1e-5,))
     return [
-        replace(own, day=1.0, days=(1.0, 1.0), temperature_degc=degc, over_t=np.array([[1.0, degc, degc**2]]))
+        replace(
+            own, day=1.0, days=(1.0, 1.0), temperature_degc=degc, over_t=np.array([[1.0, degc, degc**2]]), behind_k=1.5
+        )
         for degc in (5.0, 40.0)
     ]
 

@@ -177,22 +177,29 @@ def test_temperature_is_told_from_drift() -> None:
     random = np.random.default_rng(6)
     model = TemperatureModel(offset_order=1, sensitivity_order=1, u_offset_mps2=(0.05, 1e-3), u_sensitivity=1e-3)
     found = mounted(model=model, wander=replace(Wander.none(), offset_mps2=1e-3, offset_rate_mps2=1e-3))
-    per_k, of_main = np.array([0.01, -0.02, 0.005]), np.array([0.0, 5e-4, 0.0])
+    per_k, of_S = np.array([0.01, -0.02, 0.005]), np.array([[0.0, 0.0, 2e-4], [3e-4, 5e-4, 0.0], [0.0, 0.0, -4e-4]])
     for k in range(150):
         day = k / 24
         above = 8.0 * np.sin(2 * np.pi * day)
-        S = S_TRUE * (1.0 + of_main * above)[:, None]
+        S = S_TRUE + of_S * above
         Q = Q_TRUE + per_k * above + 0.003 * day
-        # Under gravity a row of S that depends on temperature moves the mean as well; the model's Q takes that up.
-        found.update(Record.of(building_window(random, S=S, Q=Q, level_mps2=(0.1, 0.3, 0.1)), day, 0.0, 20.0 + above))
-    moved = per_k + of_main * (S_TRUE @ GRAVITY)
-    for i, axis in enumerate("xyz"):
+        found.update(Record.of(building_window(random, S=S, Q=Q, level_mps2=(0.3, 0.3, 0.3)), day, 0.0, 20.0 + above))
+    for i, axis in enumerate("xyz"):  # under gravity S moves the mean as well, which is no change of Q
         value, u = found.quantity(f"Q{axis}_T1")
-        assert abs(value - moved[i]) < 4 * u
+        assert abs(value - per_k[i]) < 4 * u
         assert u < 1e-3
-    value, u = found.quantity("Sy_T1")
-    assert abs(value - 5e-4) < 4 * u
-    assert u < 1e-4
+        for j, way in enumerate("xyz"):
+            value, u = found.quantity(f"S{axis}{way}_T1")
+            assert abs(value - of_S[i, j]) < 4 * u
+            assert u < 5e-5
+    at_30 = found.law().at(30.0)
+    np.testing.assert_allclose(at_30.sensitivity, S_TRUE + 10.0 * of_S, rtol=0, atol=1.5e-3)
+    np.testing.assert_allclose(
+        at_30.sensitivity @ GRAVITY + at_30.offset,
+        (S_TRUE + 10.0 * of_S) @ GRAVITY + Q_TRUE + 10.0 * per_k + 0.003 * day,
+        rtol=0,
+        atol=5e-3,
+    )
     low, high = found.temperature_range_degc
     assert (low, high) == pytest.approx((12.0, 28.0), abs=0.2)
 
