@@ -16,7 +16,7 @@ from agent.core.raw_watch import RawWatch
 from agent.core.schedule import Piece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
-from agent.core.windows import Found, limits_of, margin_of, refused, windows_in
+from agent.core.windows import Found, limits_of, margin_of, points_in, refused, windows_in
 from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
@@ -205,6 +205,7 @@ class Streams:
             of = "" if name == self._channel.sensor else "reference_"
             numbers[f"{of}missing_samples"] = stream.missing(start_s, stop_s)
             numbers[f"{of}restarts"] = len(stream.breaks(start_s, stop_s))
+            numbers[f"{of}late_samples"] = stream.late(start_s, stop_s)
         return {name: float(count) for name, count in numbers.items() if count}
 
     def _of_part(
@@ -327,7 +328,11 @@ class Streams:
             return found.refused(UNSETTLED), lag_s, None
         if not estimation.contradicted(found, day, lag_s):
             return found, lag_s, None
-        anew = estimation.lag_watch.search(estimation.state, make, found.windows, day)
+        beside, to_hz = self._beside[self.place], estimation.state.motion_to_hz
+        points = points_in(piece, first_s, beside, self.by_device, lag_s, response, to_hz)
+        if points is None:
+            return found, lag_s, None
+        anew = estimation.lag_watch.search(estimation.state, make, found, lag_s, piece.pose, points, day)
         if anew is not None and not anew.beyond:
             return anew.found, anew.lag_s, anew
         return found.because(estimation.lag_watch.beyond), lag_s, None

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array, Window
 
@@ -14,6 +15,8 @@ BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the
 # Limit of (omega lag)^3 / 6, the error of the window equations, which are of second order in the remaining lag.
 PHASE_LEFT = 1e-8
 AS_HIGH = 0.9  # of the highest peak of a correlation: peaks of motion with one frequency differ by less
+FINER = 4  # lags a sample: the fastest motion that resampling keeps turns by half a rad from one to the next
+IntArray = NDArray[np.int64]
 Made = TypeVar("Made")
 
 
@@ -43,14 +46,42 @@ def without_lag(
         del made, windows  # of a day, they would need as much memory as those that follow
 
 
-def starts(low_s: float, high_s: float, windows: Sequence[Window]) -> list[float]:
-    """Lags in s from `low_s` to `high_s`, so dense that one of them is near enough to every lag between (BASIN_RAD).
+def misfit_by_lag(
+    V: Array, expected: Array, sample: IntArray, rate_hz: float, furthest_s: float
+) -> tuple[Array, Array]:
+    """How badly outputs fit what was expected of them, had they come later by each of L lags (L,) in s, which rise.
 
-    The `windows`, used or not, tell how fast the motion is. `without_lag` leads from the best of them to the lag.
+    V (n, 3) and `expected` (n, 3) are at the same times, the numbers (n,) of their samples at `rate_hz` rise. The lags
+    reach as far as `furthest_s` to both sides, but leave half of the time. The misfit (L,) is the mean square of what
+    is left, over the least of it, times the 3 n values: of white noise it rises by 1 one standard uncertainty away.
+    All lags follow from the same spectra.
     """
-    count = int(np.ceil((high_s - low_s) * max(largest_omega(windows), np.finfo(float).tiny) / (2.0 * BASIN_RAD)))
-    edges = np.linspace(low_s, high_s, max(count, 1) + 1)
-    return [float(lag_s) for lag_s in 0.5 * (edges[:-1] + edges[1:])]
+    n = int(sample[-1] - sample[0]) + 1
+    size = min(int(np.ceil(furthest_s * rate_hz)), n // 2)
+    length = 1 << (n + size).bit_length()
+    rows = np.zeros((9, n))
+    at = sample - sample[0]
+    rows[0, at] = 1.0
+    rows[1:4, at], rows[4:7, at] = (x.T - x.mean(axis=0)[:, None] for x in (V, expected))
+    rows[7], rows[8] = np.sum(rows[1:4] ** 2, axis=0), np.sum(rows[4:7] ** 2, axis=0)
+    there, out, moved, square, moved_square = np.split(np.fft.rfft(rows, length, axis=1), [1, 4, 7, 8])
+    left = square * there.conj() + there * moved_square.conj() - 2.0 * np.sum(out * moved.conj(), axis=0)
+    both = np.fft.irfft(np.vstack([left, there * there.conj()]), FINER * length, axis=1)
+    k = np.arange(-FINER * size, FINER * size + 1)
+    mean_square = both[0, k] / both[1, k]
+    least = max(float(mean_square.min()), np.finfo(float).tiny)
+    return k / (FINER * rate_hz), 3.0 * len(V) * mean_square / least
+
+
+def minima(lags_s: Array, misfit: Array) -> tuple[Array, Array]:
+    """The lags (M,) in s and the values (M,) of the minima of a misfit (L,) at evenly spaced lags (L,), the deepest
+    first: those of the parabola through the lowest lag and its two neighbours."""
+    before, here, after = misfit[:-2], misfit[1:-1], misfit[2:]
+    k = np.flatnonzero((here < before) & (here <= after))
+    slope, bend = 0.5 * (after[k] - before[k]), after[k] - 2.0 * here[k] + before[k]
+    at_s, depth = lags_s[k + 1] - slope / bend * (lags_s[1] - lags_s[0]), here[k] - 0.5 * slope**2 / bend
+    order = np.argsort(depth, kind="stable")
+    return at_s[order], depth[order]
 
 
 def largest_omega(windows: Sequence[Window]) -> float:

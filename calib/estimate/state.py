@@ -145,6 +145,12 @@ class State:
         trial._take(used, ahead, rows)
         return told, trial
 
+    def lag_with(self, record: Record) -> float:
+        """The lag once a window is taken, by its equations linearised at the lag that was taken out of it."""
+        _, trial, record, ahead, rows = self._against(record, at_its_lag=True)
+        trial._now = ahead.with_window(record, rows)
+        return trial.lag_s
+
     def _against(self, record: Record, at_its_lag: bool) -> tuple[Innovation, Self, Record, Now, Array]:
         trial = self.copy()
         record, ahead = trial._know(record)
