@@ -28,6 +28,7 @@ from calib.signal.order_statistics import median
 FOUND_WITHIN_U = 4.0  # stated standard uncertainties; one sound lag in 16,000 is beyond
 # Beyond that range, a lag is looked for only to tell the operator: as far again, and at least as far as this.
 LOOKED_WITHIN_S = 0.1
+NEAR_RAD = 0.05  # of the motion's mean phase: so far the equations of a window are right to 2e-5 of the motion
 TOLD_FROM_U = 4.0  # a change of the lag by so many of its standard uncertainties is told
 
 
@@ -105,7 +106,7 @@ class LagWatch:
         self._unexplained += 1
         if self._unexplained & (self._unexplained - 1):
             return None
-        anew = search(state, self._priors, self._limit, make, lags_s, day)
+        anew = search(state, self._priors, self._limit, make, contradicting, lag_s, lags_s, day)
         self.beyond = "" if anew is None else anew.beyond
         return anew
 
@@ -174,25 +175,39 @@ def likelier(state: State, priors: Priors, limit: Limit, pose: Pose, points: Poi
 
 
 def search(
-    state: State, priors: Priors, limit: Limit, make: Callable[[float], Found], lags_s: Sequence[float], day: float
+    state: State,
+    priors: Priors,
+    limit: Limit,
+    make: Callable[[float], Found],
+    contradicting: Found,
+    taken_s: float,
+    lags_s: Sequence[float],
+    day: float,
 ) -> Anew | None:
-    """Search the lag anew from these lags on, one after the other; None if no lag explains the windows.
+    """Search the lag anew from `lags_s` on, one after the other; None if no lag explains the windows.
 
-    `make(lag_s)` makes the windows again with this lag taken out.
+    `make(lag_s)` makes the windows again with this lag taken out; `contradicting` are those with `taken_s` taken out.
+    Of a lag near `taken_s` they tell themselves that it does not explain them.
     """
     loose = state.copy()
     loose.step(loose.changes(np.zeros(12), line=True))
     mean_s, within_s, _ = _ranges(priors)
 
-    def made(lag_s: float) -> tuple[Found, list[Record]]:
-        found = make(lag_s)
+    def with_records(found: Found, lag_s: float) -> tuple[Found, list[Record]]:
         told = lag_s, found.temperature_degc, state.reference, state.motion_to_hz
         return found, [Record.of(window, day, *told) for window in found.used]
+
+    def made(lag_s: float) -> tuple[Found, list[Record]]:
+        return with_records(make(lag_s), lag_s)
 
     def lag_after(made: tuple[Found, list[Record]], _: float) -> float:
         return loose.lag_with(max(made[1], key=lambda record: record.count))
 
+    before = with_records(contradicting, taken_s)[1]
+    near_s = NEAR_RAD / max(largest_omega(contradicting.windows), np.finfo(float).tiny)
     for start_s in lags_s:
+        if before and abs(start_s - taken_s) <= near_s and not _explains(loose, before, limit):
+            continue
         (found, records), lag_s = without_lag(start_s, made, lambda made: made[0].used, lag_after)
         for base in (state, loose):
             if not _explains(base, records, limit):

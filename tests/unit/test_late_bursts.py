@@ -45,7 +45,9 @@ def test_every_window_is_used_right_and_tells_how_many_samples_were_late(device:
     told = np.array([w.numbers.get(name, 0.0) for w in windows])
     starts_s = GUARD_S + WINDOW_S * np.arange(len(windows))[:, None]
     within_s = np.minimum(starts_s + WINDOW_S, SINCE_S + LASTS_S) - np.maximum(starts_s, SINCE_S)
-    np.testing.assert_allclose(told, RATE_HZ * within_s.clip(0.0).sum(axis=1), atol=3 * 32)  # a burst has 32 samples; up to four ends
+    np.testing.assert_allclose(
+        told, RATE_HZ * within_s.clip(0.0).sum(axis=1), atol=3 * 32
+    )  # a burst has 32 samples; up to four ends
     update = [r for r in results if isinstance(r, CalibrationUpdate)][-1]
     true = drawn.building.truth(run.now_s)
     error = np.append(update.sensitivity, update.offset) - np.append(true.sensitivity, true.offset_at_mean)
