@@ -16,7 +16,7 @@ from agent.core.raw_watch import RawWatch
 from agent.core.schedule import Piece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
-from agent.core.windows import Found, limits_of, margin_of, points_in, refused, windows_in
+from agent.core.windows import Found, aligned_in, limits_of, margin_of, refused, windows_in
 from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
@@ -326,16 +326,38 @@ class Streams:
             response = trial.response.modest
         else:
             return found.refused(UNSETTLED), lag_s, None
-        if not estimation.contradicted(found, day, lag_s):
+        if estimation.contradicted(found, day, lag_s):
+            return self._explained(piece, first_s, day, estimation, found, lag_s, response)
+        return found, lag_s, None
+
+    def _explained(
+        self,
+        piece: Piece,
+        first_s: float,
+        day: float,
+        estimation: Estimation,
+        found: Found,
+        lag_s: float,
+        response: Response,
+    ) -> tuple[Found, float, Anew | None]:
+        """As `_found`, of windows that contradict: those of the part whose samples have the known lag, where others have
+        not; else those at another lag, if one explains them; else what was found."""
+        state, watch, to_hz = estimation.state, estimation.lag_watch, estimation.state.motion_to_hz
+        samples = aligned_in(piece, first_s, self._beside[self.place], self.by_device, lag_s, response, to_hz)
+        if samples is None:
             return found, lag_s, None
-        beside, to_hz = self._beside[self.place], estimation.state.motion_to_hz
-        points = points_in(piece, first_s, beside, self.by_device, lag_s, response, to_hz)
-        if points is None:
-            return found, lag_s, None
-        anew = estimation.lag_watch.search(estimation.state, make, found, lag_s, piece.pose, points, day)
+        if (part_s := watch.part_in_time(state, piece.pose, samples, lag_s)) is not None:
+            part = replace(piece, start_s=part_s[0] - first_s, stop_s=part_s[1] - first_s)
+            within = self._make(part, first_s, response, to_hz, lag_s)
+            if within.used and not estimation.contradicted(within, day, lag_s):
+                time_s = samples.points.time_s
+                count = np.count_nonzero((time_s < part_s[0]) | (time_s > part_s[1]))
+                return within.told({"misplaced_samples": float(count)}), lag_s, None
+        make = partial(self._make, piece, first_s, response, to_hz)
+        anew = watch.search(state, make, found, lag_s, piece.pose, samples, day)
         if anew is not None and not anew.beyond:
             return anew.found, anew.lag_s, anew
-        return found.because(estimation.lag_watch.beyond), lag_s, None
+        return found.because(watch.beyond), lag_s, None
 
     def _make(self, piece: Piece, first_s: float, response: Response, to_hz: float, lag_s: float) -> Found:
         beside, limits = self._beside[self.place], self._limits[self.place]

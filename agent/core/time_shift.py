@@ -17,12 +17,12 @@ import numpy as np
 from agent.config import Channel
 from agent.core.gate import Limit
 from agent.core.windows import Found
-from calib.estimate.lag_search import BASIN_RAD, largest_omega, minima, misfit_by_lag, without_lag
+from calib.estimate.lag_search import BASIN_RAD, largest_omega, longest_in_time, minima, misfit_by_lag, without_lag
 from calib.estimate.nuisances import Priors
 from calib.estimate.record import Record
 from calib.estimate.state import State
-from calib.excitation.windows import Points
-from calib.model import Pose, own_channels
+from calib.excitation.front_end import Aligned
+from calib.model import Array, Pose, own_channels
 from calib.signal.order_statistics import median
 
 FOUND_WITHIN_U = 4.0  # stated standard uncertainties; one sound lag in 16,000 is beyond
@@ -87,16 +87,16 @@ class LagWatch:
         contradicting: Found,
         lag_s: float,
         pose: Pose,
-        points: Points,
+        samples: Aligned,
         day: float,
     ) -> Anew | None:
         """See `search`; the lags that it tries are those of `likelier`.
 
-        `contradicting` are the windows made before, from `points` in this pose, with `lag_s` taken out. A search makes
+        `contradicting` are the windows made before, from `samples` in this pose, with `lag_s` taken out. A search makes
         windows again, up to four times for each lag. A lag at which it failed is tried again only for the contradicting
         pieces number 2, 4, 8 and so on at this lag since the last window that was taken.
         """
-        lags_s = likelier(state, self._priors, self._limit, pose, points, lag_s)
+        lags_s = likelier(state, self._priors, self._limit, pose, samples, lag_s)
         if not lags_s:
             self.beyond = ""
             return None
@@ -109,6 +109,15 @@ class LagWatch:
         anew = search(state, self._priors, self._limit, make, contradicting, lag_s, lags_s, day)
         self.beyond = "" if anew is None else anew.beyond
         return anew
+
+    def part_in_time(self, state: State, pose: Pose, samples: Aligned, lag_s: float) -> tuple[float, float] | None:
+        """The longest part of the samples, made with `lag_s` taken out, that has this lag, from one time in s to
+        another; None where all of it has, or none."""
+        mean_s, _, looked_s = _ranges(self._priors)
+        least_fall = self._limit(1.0) / samples.independent
+        furthest_s = looked_s + abs(lag_s - mean_s)
+        expected = _expected(state, pose, samples)
+        return longest_in_time(samples.points.V, expected, samples.points.time_s, furthest_s, least_fall)
 
     def began(self, state: State, device: str) -> None:
         """A device or its line began anew: it may be late by another time from now on, as far as stated."""
@@ -150,28 +159,32 @@ class LagWatch:
         self.beyond = state["beyond"]
 
 
-def likelier(state: State, priors: Priors, limit: Limit, pose: Pose, points: Points, taken_s: float) -> list[float]:
+def likelier(state: State, priors: Priors, limit: Limit, pose: Pose, samples: Aligned, taken_s: float) -> list[float]:
     """The lags in s that may explain samples in this pose that contradict the state; none where no other lag brings
     outputs and motion together better than `taken_s`, by more than chance: then the contradiction is no lag.
 
-    `points` were made with `taken_s` taken out. First comes the likeliest lag within what is stated, then, if it is
+    `samples` were made with `taken_s` taken out. First comes the likeliest lag within what is stated, then, if it is
     likelier, the likeliest one of those that are looked at beyond, to tell the operator.
     """
-    u = points.u[:, : own_channels(points.u.shape[1])]
-    expected = u @ (state.result().sensitivity @ pose.direction).T
-    rate_hz = 1.0 / float(median(np.diff(points.time_s)))
-    sample = np.rint((points.time_s - points.time_s[0]) * rate_hz).astype(np.int64)
+    V, time_s, expected = samples.points.V, samples.points.time_s, _expected(state, pose, samples)
+    rate_hz = 1.0 / float(median(np.diff(time_s)))
+    sample = np.rint((time_s - time_s[0]) * rate_hz).astype(np.int64)
     mean_s, within_s, looked_s = _ranges(priors)
-    furthest_s = looked_s + abs(taken_s - mean_s)
-    lags_s, misfit = misfit_by_lag(points.V, expected, sample, rate_hz, furthest_s)
+    lags_s, misfit = misfit_by_lag(V, expected, sample, rate_hz, looked_s + abs(taken_s - mean_s))
     at_s, depth = minima(taken_s + lags_s, misfit)
     found, least, off_s = list[float](), float(misfit[len(misfit) // 2]), np.abs(at_s - mean_s)
     for low_s, high_s in ((-1.0, within_s), (within_s, looked_s)):
         likeliest = np.flatnonzero((off_s > low_s) & (off_s <= high_s))[:1]
-        if len(likeliest) and depth[likeliest[0]] < least - limit(1.0):
+        if len(likeliest) and depth[likeliest[0]] < least - limit(1.0) / samples.independent:
             found.append(float(at_s[likeliest[0]]))
             least = float(depth[likeliest[0]])
     return found
+
+
+def _expected(state: State, pose: Pose, samples: Aligned) -> Array:
+    """(n, 3) what the state expects of the outputs in this pose, but for a constant."""
+    u = samples.points.u
+    return np.asarray(u[:, : own_channels(u.shape[1])] @ (state.result().sensitivity @ pose.direction).T)
 
 
 def search(

@@ -11,9 +11,17 @@ from agent.config import Channel
 from agent.core.schedule import Piece
 from agent.core.stream import DeviceStream
 from calib.excitation.bands import ABOVE, HIGHEST, motion_band_hz, share_above
-from calib.excitation.front_end import LEAST_MARGIN_S, Settings, Unusable, aligned, margin_s, nothing_in, windows_of
+from calib.excitation.front_end import (
+    LEAST_MARGIN_S,
+    Aligned,
+    Settings,
+    Unusable,
+    aligned,
+    margin_s,
+    nothing_in,
+    windows_of,
+)
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
-from calib.excitation.windows import Points
 from calib.model import Window
 from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
@@ -84,7 +92,7 @@ def windows_in(
     return Found(found, sensor.temperature_degc)
 
 
-def points_in(
+def aligned_in(
     piece: Piece,
     first_s: float,
     channel: Channel,
@@ -92,7 +100,7 @@ def points_in(
     lag_s: float,
     response: Response = FLAT,
     to_hz: float = np.inf,
-) -> Points | None:
+) -> Aligned | None:
     """The samples of a stretch from which `windows_in` makes its windows, with the same parameters; None where there
     is no reference beside them."""
     span_s = first_s + piece.start_s, first_s + piece.stop_s
@@ -103,8 +111,7 @@ def points_in(
         return None
     if reference is None:
         return None
-    found = aligned(sensor, reference, channel.instrument, span_s, lag_s, settings, response)
-    return None if found is None else found.points
+    return aligned(sensor, reference, channel.instrument, span_s, lag_s, settings, response)
 
 
 def _cut(

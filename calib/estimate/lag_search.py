@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array, Window
+from calib.signal.order_statistics import median
 
 TURNS = 4  # each iteration leaves about a thousandth of the lag
 BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the iterations lead to the lag
@@ -16,6 +18,7 @@ BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the
 PHASE_LEFT = 1e-8
 AS_HIGH = 0.9  # of the highest peak of a correlation: peaks of motion with one frequency differ by less
 FINER = 4  # lags a sample: the fastest motion that resampling keeps turns by half a rad from one to the next
+SEGMENT_S = 2.0  # of samples that have one lag: a few cycles of the motion
 IntArray = NDArray[np.int64]
 Made = TypeVar("Made")
 
@@ -71,6 +74,34 @@ def misfit_by_lag(
     mean_square = both[0, k] / both[1, k]
     least = max(float(mean_square.min()), np.finfo(float).tiny)
     return k / (FINER * rate_hz), 3.0 * len(V) * mean_square / least
+
+
+def longest_in_time(
+    V: Array, expected: Array, time_s: Array, furthest_s: float, least_fall: float
+) -> tuple[float, float] | None:
+    """The longest stretch of outputs V (n, 3) that come when they are expected (n, 3), from one time in s to another;
+    None where all do, or none does.
+
+    Stretches of SEGMENT_S are looked at one by one. One of them comes at another lag, up to `furthest_s`, if it fits
+    half as badly there and the misfit (see `misfit_by_lag`) falls by `least_fall`. A sensitivity that changes, a knock
+    or noise do not look so. Beside a stretch at another lag, one more is left out: the lag may change within it.
+    """
+    rate_hz = 1.0 / float(median(np.diff(time_s)))
+    sample = np.rint((time_s - time_s[0]) * rate_hz).astype(np.int64)
+    edges = np.arange(0.0, max(time_s[-1] - time_s[0] - 0.5 * SEGMENT_S, SEGMENT_S), SEGMENT_S)
+    cuts = [*np.searchsorted(time_s, time_s[0] + edges).tolist(), len(time_s)]
+    off = np.zeros(len(cuts) - 1, dtype=bool)
+    for k, (a, b) in enumerate(itertools.pairwise(cuts)):
+        if b - a >= 0.5 * SEGMENT_S * rate_hz:
+            _, misfit = misfit_by_lag(V[a:b], expected[a:b], sample[a:b], rate_hz, furthest_s)
+            here, least = float(misfit[len(misfit) // 2]), float(misfit.min())
+            off[k] = least < 0.5 * here and here - least > least_fall
+    left = off | np.append(off[1:], False) | np.append(False, off[:-1])
+    if not off.any() or left.all():
+        return None
+    ends = np.flatnonzero(np.diff(left, prepend=True, append=True)).reshape(-1, 2)
+    first, stop = ends[np.argmax(ends[:, 1] - ends[:, 0])].tolist()
+    return float(time_s[cuts[first]]), float(time_s[cuts[stop] - 1])
 
 
 def minima(lags_s: Array, misfit: Array) -> tuple[Array, Array]:

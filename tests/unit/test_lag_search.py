@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.lag_search import minima, misfit_by_lag
+from calib.estimate.lag_search import longest_in_time, minima, misfit_by_lag
 
 RATE_HZ, SECONDS, NOISE = 100.0, 40.0, 0.05
 S = np.array([[2.0, 0.02, -0.01], [0.01, 1.9, 0.03], [0.0, 0.02, 2.1]])
@@ -50,3 +50,47 @@ def test_beside_the_lag_the_misfit_is_that_of_noise_alone() -> None:
 def test_of_one_frequency_each_period_is_a_minimum() -> None:
     at_s = found(0.02, 1, (9.999, 10.001))[:3, 0]
     np.testing.assert_allclose(np.sort(at_s), [-0.08, 0.02, 0.12], atol=1e-3)
+
+
+def outputs(lag_s: np.ndarray, seed: int = 1, size: np.ndarray | float = 1.0) -> tuple[np.ndarray, ...]:
+    """(V, expected, time) where each sample has a lag of its own and S is `size` times what is expected."""
+    time_s = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
+    V = size * (motion(time_s - lag_s, seed, (0.5, 12.0)) @ S.T)
+    noise = NOISE * np.random.default_rng(seed).normal(size=V.shape)
+    return V + noise, motion(time_s, seed, (0.5, 12.0)) @ S.T, time_s
+
+
+time_of_all_s = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
+
+
+@pytest.mark.parametrize("lag_s", [0.05, -0.05, 0.01])
+@pytest.mark.parametrize(
+    ("off_s", "longest_s"), [((0.0, 10.0), (10.0, 40.0)), ((14.5, 24.5), (24.5, 40.0)), ((31.0, 40.0), (0.0, 31.0))]
+)
+def test_the_longest_part_without_another_lag_is_found(
+    lag_s: float, off_s: tuple[float, float], longest_s: tuple[float, float]
+) -> None:
+    since_s, until_s = off_s
+    V, expected, time_s = outputs(np.where((time_of_all_s >= since_s) & (time_of_all_s < until_s), lag_s, 0.0))
+    found = longest_in_time(V, expected, time_s, 0.15, 50.0)
+    assert found is not None
+    assert longest_s[0] <= found[0] <= longest_s[0] + 4.0  # two stretches of 2 s at the most
+    assert longest_s[1] - 4.0 <= found[1] <= longest_s[1]
+
+
+def test_where_all_or_nothing_is_in_time_there_is_no_part() -> None:
+    assert longest_in_time(*outputs(np.zeros(len(time_of_all_s))), 0.15, 50.0) is None
+    assert longest_in_time(*outputs(np.full(len(time_of_all_s), 0.05)), 0.15, 50.0) is None
+
+
+def test_another_sensitivity_a_knock_and_a_stuck_output_are_no_other_lag() -> None:
+    middle = (time_of_all_s >= 14.5) & (time_of_all_s < 24.5)
+    assert (
+        longest_in_time(*outputs(np.zeros(len(time_of_all_s)), size=np.where(middle, 1.05, 1.0)[:, None]), 0.15, 50.0)
+        is None
+    )
+    V, expected, time_s = outputs(np.zeros(len(time_of_all_s)))
+    knocked = V + 20.0 * np.exp(-np.abs(time_of_all_s - 20.0) / 0.02)[:, None]
+    assert longest_in_time(knocked, expected, time_s, 0.15, 50.0) is None
+    stuck = np.where(middle[:, None], V[1450], V)
+    assert longest_in_time(stuck, expected, time_s, 0.15, 50.0) is None
