@@ -314,9 +314,11 @@ class Streams:
 
         def lag_of(found: Found, lag_s: float) -> float:
             nonlocal trial
-            trial = estimation.after(found.used, day, lag_s, found.temperature_degc)
             # What contradicts a known state must not move its lag: that would be an answer to another question.
-            return lag_s if known and estimation.contradicted(found, day, lag_s) else trial.lag_s
+            if known and estimation.contradicted(found, day, lag_s):
+                return lag_s
+            trial = estimation.after(found.used, day, lag_s, found.temperature_degc)
+            return trial.lag_s
 
         for _ in range(RESPONSE_TURNS):
             make = partial(self._make, piece, first_s, response, estimation.state.motion_to_hz)
@@ -340,8 +342,8 @@ class Streams:
         lag_s: float,
         response: Response,
     ) -> tuple[Found, float, Anew | None]:
-        """As `_found`, of windows that contradict: those of the part whose samples have the known lag, where others have
-        not; else those at another lag, if one explains them; else what was found."""
+        """As `_found`, of windows that contradict: those of the part whose samples have the known lag, where others
+        have not; else those at another lag, if one explains them; else what was found."""
         state, watch, to_hz = estimation.state, estimation.lag_watch, estimation.state.motion_to_hz
         samples = aligned_in(piece, first_s, self._beside[self.place], self.by_device, lag_s, response, to_hz)
         if samples is None:
