@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -72,14 +73,19 @@ class Proposal:
         return cls(Calibration(**state["calibration"]), records, [Step(**step) for step in state["steps"]], shares)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Tried:
-    """A window tried on the state: what it says, and the state that has taken it."""
+    """A window tried on the state: what it says; `after` is the state that has taken it."""
 
     window_sums: WindowSums
     record: Record
     innovation: Innovation
-    after: State
+    taken: Callable[[], State]
+
+    @cached_property
+    def after(self) -> State:
+        """Made when it is first asked for."""
+        return self.taken()
 
 
 class Estimation:
@@ -105,7 +111,7 @@ class Estimation:
         self._held: list[Record] = []
         self._proposed: list[Proposal] = []
         self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
-        self._tried: Tried | None = None  # what `after` did, for `judge` right after it
+        self._tried: Tried | None = None  # the newest window, for what is asked of it next
         self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
 
@@ -156,8 +162,7 @@ class Estimation:
 
     def after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> State:
         """The state once these windows, made with `lag_s` taken out, were taken."""
-        self._tried = self._try(windows[0], day, lag_s, temperature_degc)
-        trial = self._tried.after
+        trial = self._tried_of(windows[0], day, lag_s, temperature_degc).after
         for window in windows[1:]:
             _, trial = trial.with_window(self._record(window, day, lag_s, temperature_degc))
         return trial
@@ -188,7 +193,7 @@ class Estimation:
                 self.gate.dismiss()  # windows held before were made with another lag
                 self._held = []
             record = self._record(window, day, lag_s, temperature_degc)
-            tried = Tried(window.sums, record, *self.state.with_window(record, at_its_lag=True))
+            tried = Tried(window.sums, record, *self.state.tried(record, at_its_lag=True))
         self._tried = None
         record, innovation, trial = tried.record, tried.innovation, tried.after
         candidate, confirm = trial.result(), self._channel.gate.confirm_windows
@@ -265,15 +270,12 @@ class Estimation:
         return explained(self.state, self._held, jump, self.gate.limit, fixed_mount=fixed)
 
     def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
-        """The window tried on the state; what `after` did is not done again."""
+        """The window tried on the state; the newest one is not tried again."""
         tried = self._tried
-        if tried is not None and tried.window_sums is window.sums and tried.record.lag_s == lag_s:
-            return tried
-        return self._try(window, day, lag_s, temperature_degc)
-
-    def _try(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
-        record = self._record(window, day, lag_s, temperature_degc)
-        return Tried(window.sums, record, *self.state.with_window(record))
+        if tried is None or tried.window_sums is not window.sums or tried.record.lag_s != lag_s:
+            record = self._record(window, day, lag_s, temperature_degc)
+            self._tried = tried = Tried(window.sums, record, *self.state.tried(record))
+        return tried
 
     def shares_of(self, calibration: Calibration) -> Sequence[ReferenceShare]:
         """What a calibration owes to the references, where that is known."""

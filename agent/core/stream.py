@@ -184,6 +184,16 @@ class DeviceStream:
                     count += hole[1] - hole[0] if began_s < stop_s and ended_s > start_s else 0
         return count
 
+    def late(self, start_s: float, stop_s: float) -> int:
+        """How many samples between these times arrived so late that the clock does not follow from them."""
+        count = 0
+        for run in self._runs:
+            if run.blocks and run.in_time:
+                within = run.clock().index_of(np.array([start_s, stop_s]))
+                first, last = run.clock().late.T
+                count += int(np.sum((np.minimum(last, within[1]) - np.maximum(first, within[0]) + 1.0).clip(0.0)))
+        return count
+
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
         """All samples with start_s <= t < stop_s by the clock model as it is now; None if there are none.
 

@@ -16,7 +16,7 @@ from agent.core.raw_watch import RawWatch
 from agent.core.schedule import Piece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
-from agent.core.windows import Found, limits_of, margin_of, refused, windows_in
+from agent.core.windows import Found, aligned_in, limits_of, margin_of, refused, windows_in
 from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.placing import Placed
@@ -205,6 +205,7 @@ class Streams:
             of = "" if name == self._channel.sensor else "reference_"
             numbers[f"{of}missing_samples"] = stream.missing(start_s, stop_s)
             numbers[f"{of}restarts"] = len(stream.breaks(start_s, stop_s))
+            numbers[f"{of}late_samples"] = stream.late(start_s, stop_s)
         return {name: float(count) for name, count in numbers.items() if count}
 
     def _of_part(
@@ -313,9 +314,11 @@ class Streams:
 
         def lag_of(found: Found, lag_s: float) -> float:
             nonlocal trial
-            trial = estimation.after(found.used, day, lag_s, found.temperature_degc)
             # What contradicts a known state must not move its lag: that would be an answer to another question.
-            return lag_s if known and estimation.contradicted(found, day, lag_s) else trial.lag_s
+            if known and estimation.contradicted(found, day, lag_s):
+                return lag_s
+            trial = estimation.after(found.used, day, lag_s, found.temperature_degc)
+            return trial.lag_s
 
         for _ in range(RESPONSE_TURNS):
             make = partial(self._make, piece, first_s, response, estimation.state.motion_to_hz)
@@ -325,12 +328,38 @@ class Streams:
             response = trial.response.modest
         else:
             return found.refused(UNSETTLED), lag_s, None
-        if not estimation.contradicted(found, day, lag_s):
+        if estimation.contradicted(found, day, lag_s):
+            return self._explained(piece, first_s, day, estimation, found, lag_s, response)
+        return found, lag_s, None
+
+    def _explained(
+        self,
+        piece: Piece,
+        first_s: float,
+        day: float,
+        estimation: Estimation,
+        found: Found,
+        lag_s: float,
+        response: Response,
+    ) -> tuple[Found, float, Anew | None]:
+        """As `_found`, of windows that contradict: those of the part whose samples have the known lag, where others
+        have not; else those at another lag, if one explains them; else what was found."""
+        state, watch, to_hz = estimation.state, estimation.lag_watch, estimation.state.motion_to_hz
+        samples = aligned_in(piece, first_s, self._beside[self.place], self.by_device, lag_s, response, to_hz)
+        if samples is None:
             return found, lag_s, None
-        anew = estimation.lag_watch.search(estimation.state, make, found.windows, day)
+        if (part_s := watch.part_in_time(state, piece.pose, samples, lag_s)) is not None:
+            part = replace(piece, start_s=part_s[0] - first_s, stop_s=part_s[1] - first_s)
+            within = self._make(part, first_s, response, to_hz, lag_s)
+            if within.used and not estimation.contradicted(within, day, lag_s):
+                time_s = samples.points.time_s
+                count = np.count_nonzero((time_s < part_s[0]) | (time_s > part_s[1]))
+                return within.told({"misplaced_samples": float(count)}), lag_s, None
+        make = partial(self._make, piece, first_s, response, to_hz)
+        anew = watch.search(state, make, found, lag_s, piece.pose, samples, day)
         if anew is not None and not anew.beyond:
             return anew.found, anew.lag_s, anew
-        return found.because(estimation.lag_watch.beyond), lag_s, None
+        return found.because(watch.beyond), lag_s, None
 
     def _make(self, piece: Piece, first_s: float, response: Response, to_hz: float, lag_s: float) -> Found:
         beside, limits = self._beside[self.place], self._limits[self.place]

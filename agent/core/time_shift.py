@@ -2,7 +2,8 @@
 
 After some windows the state knows the lag well. When the time stamps of one device then shift, every window contradicts
 the state, and its equations, which are of second order in the change of the lag, cannot lead to the new lag. So the lag
-is searched anew in all the range that is stated for it.
+is looked for anew in all the range that is stated for it. How well the outputs fit the motion at any lag follows from
+one cross-spectrum; only at a lag at which they fit better than now are windows made again.
 """
 
 from __future__ import annotations
@@ -16,15 +17,18 @@ import numpy as np
 from agent.config import Channel
 from agent.core.gate import Limit
 from agent.core.windows import Found
-from calib.estimate.lag_search import starts, without_lag
+from calib.estimate.lag_search import BASIN_RAD, largest_omega, longest_in_time, minima, misfit_by_lag, without_lag
 from calib.estimate.nuisances import Priors
 from calib.estimate.record import Record
 from calib.estimate.state import State
-from calib.model import Window
+from calib.excitation.front_end import Aligned
+from calib.model import Array, Pose, own_channels
+from calib.signal.order_statistics import median
 
 FOUND_WITHIN_U = 4.0  # stated standard uncertainties; one sound lag in 16,000 is beyond
 # Beyond that range, a lag is looked for only to tell the operator: as far again, and at least as far as this.
 LOOKED_WITHIN_S = 0.1
+NEAR_RAD = 0.05  # of the motion's mean phase: so far the equations of a window are right to 2e-5 of the motion
 TOLD_FROM_U = 4.0  # a change of the lag by so many of its standard uncertainties is told
 
 
@@ -72,20 +76,48 @@ class LagWatch:
         self._channel, self._limit = channel, limit
         self._priors = channel.priors(fixed_mount=channel.fixed_mount)
         self._line: Line | None = None
-        self._unexplained = 0  # pieces in a row that contradict the state at every lag that was tried
+        self._excluded_s: float | None = None  # the lag at which the newest search failed
+        self._unexplained = 0  # pieces since then whose outputs would fit best at that lag
         self.beyond = ""  # why the lag that explains the newest pieces must not be used
 
     def search(
-        self, state: State, make: Callable[[float], Found], contradicting: Sequence[Window], day: float
+        self,
+        state: State,
+        make: Callable[[float], Found],
+        contradicting: Found,
+        lag_s: float,
+        pose: Pose,
+        samples: Aligned,
+        day: float,
     ) -> Anew | None:
-        """See `search`. It costs as much as some ten windows: if it fails, it is made again only for the contradicting
-        pieces number 1, 2, 4, 8 and so on since the last window that was taken."""
+        """See `search`; the lags that it tries are those of `likelier`.
+
+        `contradicting` are the windows made before, from `samples` in this pose, with `lag_s` taken out. A search makes
+        windows again, up to four times for each lag. A lag at which it failed is tried again only for the contradicting
+        pieces number 2, 4, 8 and so on at this lag since the last window that was taken.
+        """
+        lags_s = likelier(state, self._priors, self._limit, pose, samples, lag_s)
+        if not lags_s:
+            self.beyond = ""
+            return None
+        near_s = BASIN_RAD / max(largest_omega(contradicting.windows), np.finfo(float).tiny)
+        if self._excluded_s is None or abs(lags_s[0] - self._excluded_s) > near_s:
+            self._excluded_s, self._unexplained = lags_s[0], 0
         self._unexplained += 1
         if self._unexplained & (self._unexplained - 1):
             return None
-        anew = search(state, self._priors, self._limit, make, contradicting, day)
+        anew = search(state, self._priors, self._limit, make, contradicting, lag_s, lags_s, day)
         self.beyond = "" if anew is None else anew.beyond
         return anew
+
+    def part_in_time(self, state: State, pose: Pose, samples: Aligned, lag_s: float) -> tuple[float, float] | None:
+        """The longest part of the samples, made with `lag_s` taken out, that has this lag, from one time in s to
+        another; None where all of it has, or none."""
+        mean_s, _, looked_s = _ranges(self._priors)
+        least_fall = self._limit(1.0) / samples.independent
+        furthest_s = looked_s + abs(lag_s - mean_s)
+        expected = _expected(state, pose, samples)
+        return longest_in_time(samples.points.V, expected, samples.points.time_s, furthest_s, least_fall)
 
     def began(self, state: State, device: str) -> None:
         """A device or its line began anew: it may be late by another time from now on, as far as stated."""
@@ -103,7 +135,7 @@ class LagWatch:
 
     def forget(self) -> None:
         """Another reference has a lag of its own."""
-        self._line, self._unexplained, self.beyond = None, 0, ""
+        self._line, self._excluded_s, self._unexplained, self.beyond = None, None, 0, ""
 
     def taken(self, state: State) -> str:
         """`state` has taken a window: the news of a shift for the operator, or ""."""
@@ -116,12 +148,43 @@ class LagWatch:
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
         line = None if self._line is None else asdict(self._line)
-        return {"line": line, "unexplained": self._unexplained, "beyond": self.beyond}
+        return {
+            "line": line, "excluded_s": self._excluded_s, "unexplained": self._unexplained, "beyond": self.beyond,
+        }  # fmt: skip
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
         self._line = None if state["line"] is None else Line(**state["line"])
-        self._unexplained, self.beyond = state["unexplained"], state["beyond"]
+        self._excluded_s, self._unexplained = state["excluded_s"], state["unexplained"]
+        self.beyond = state["beyond"]
+
+
+def likelier(state: State, priors: Priors, limit: Limit, pose: Pose, samples: Aligned, taken_s: float) -> list[float]:
+    """The lags in s that may explain samples in this pose that contradict the state; none where no other lag brings
+    outputs and motion together better than `taken_s`, by more than chance: then the contradiction is no lag.
+
+    `samples` were made with `taken_s` taken out. First comes the likeliest lag within what is stated, then, if it is
+    likelier, the likeliest one of those that are looked at beyond, to tell the operator.
+    """
+    V, time_s, expected = samples.points.V, samples.points.time_s, _expected(state, pose, samples)
+    rate_hz = 1.0 / float(median(np.diff(time_s)))
+    sample = np.rint((time_s - time_s[0]) * rate_hz).astype(np.int64)
+    mean_s, within_s, looked_s = _ranges(priors)
+    lags_s, misfit = misfit_by_lag(V, expected, sample, rate_hz, looked_s + abs(taken_s - mean_s))
+    at_s, depth = minima(taken_s + lags_s, misfit)
+    found, least, off_s = list[float](), float(misfit[len(misfit) // 2]), np.abs(at_s - mean_s)
+    for low_s, high_s in ((-1.0, within_s), (within_s, looked_s)):
+        likeliest = np.flatnonzero((off_s > low_s) & (off_s <= high_s))[:1]
+        if len(likeliest) and depth[likeliest[0]] < least - limit(1.0) / samples.independent:
+            found.append(float(at_s[likeliest[0]]))
+            least = float(depth[likeliest[0]])
+    return found
+
+
+def _expected(state: State, pose: Pose, samples: Aligned) -> Array:
+    """(n, 3) what the state expects of the outputs in this pose, but for a constant."""
+    u = samples.points.u
+    return np.asarray(u[:, : own_channels(u.shape[1])] @ (state.result().sensitivity @ pose.direction).T)
 
 
 def search(
@@ -129,70 +192,69 @@ def search(
     priors: Priors,
     limit: Limit,
     make: Callable[[float], Found],
-    contradicting: Sequence[Window],
+    contradicting: Found,
+    taken_s: float,
+    lags_s: Sequence[float],
     day: float,
 ) -> Anew | None:
-    """Search the lag anew over the range that is stated for it; None if no lag explains the windows.
+    """Search the lag anew from `lags_s` on, one after the other; None if no lag explains the windows.
 
-    `make(lag_s)` makes the windows again with this lag taken out; `contradicting` are those made before.
+    `make(lag_s)` makes the windows again with this lag taken out; `contradicting` are those with `taken_s` taken out.
+    Of a lag near `taken_s` they tell themselves that it does not explain them.
     """
     loose = state.copy()
     loose.step(loose.changes(np.zeros(12), line=True))
-    mean_s, within_s = priors.lag_at_s, FOUND_WITHIN_U * priors.lag_s
-    looked_s = max(2.0 * within_s, LOOKED_WITHIN_S)
-    stated = starts(mean_s - within_s, mean_s + within_s, contradicting)
-    beyond = starts(mean_s - looked_s, mean_s - within_s, contradicting)
-    beyond += starts(mean_s + within_s, mean_s + looked_s, contradicting)
-    for lags_s in (stated, beyond):
-        found, lag_s = _best(loose, make, lags_s, day)
+    mean_s, within_s, _ = _ranges(priors)
+
+    def with_records(found: Found, lag_s: float) -> tuple[Found, list[Record]]:
+        told = lag_s, found.temperature_degc, state.reference, state.motion_to_hz
+        return found, [Record.of(window, day, *told) for window in found.used]
+
+    def made(lag_s: float) -> tuple[Found, list[Record]]:
+        return with_records(make(lag_s), lag_s)
+
+    def lag_after(made: tuple[Found, list[Record]], _: float) -> float:
+        return loose.lag_with(max(made[1], key=lambda record: record.count))
+
+    before = with_records(contradicting, taken_s)[1]
+    near_s = NEAR_RAD / max(largest_omega(contradicting.windows), np.finfo(float).tiny)
+    for start_s in lags_s:
+        if before and abs(start_s - taken_s) <= near_s and not _explains(loose, before, limit):
+            continue
+        (found, records), lag_s = without_lag(start_s, made, lambda made: made[0].used, lag_after)
         for base in (state, loose):
-            if not _explains(base, found, lag_s, day, limit):
+            if not _explains(base, records, limit):
                 continue
             shifted = base is loose
-            if shifted and not _decisive(state, loose, found, lag_s, day, limit):
+            if shifted and not _decisive(state, loose, records[0], limit):
                 break
             off_s = abs(lag_s - mean_s)
             return Anew(found, lag_s, base, shifted, "" if off_s <= within_s else _too_far(lag_s, mean_s, priors.lag_s))
     return None
 
 
-def _best(loose: State, make: Callable[[float], Found], lags_s: Sequence[float], day: float) -> tuple[Found, float]:
-    """The windows and the lag to which the best of the starts `lags_s` leads."""
-
-    def misfit(lag_s: float) -> tuple[int, float]:
-        told = [loose.innovation(s, at_its_lag=True) for s in _records(make(lag_s), day, lag_s, loose)]
-        return -len(told), sum(t.statistic for t in told)
-
-    def lag_after(found: Found, lag_s: float) -> float:
-        first, *others = _records(found, day, lag_s, loose)
-        trial = loose.with_window(first, at_its_lag=True)[1]
-        for record in others:
-            trial = trial.with_window(record)[1]
-        return trial.lag_s
-
-    return without_lag(min(lags_s, key=misfit), make, lambda found: found.used, lag_after)
+def _ranges(priors: Priors) -> tuple[float, float, float]:
+    """The lag as stated, how far from it a lag may be, and how far from it one is looked for, in s."""
+    within_s = FOUND_WITHIN_U * priors.lag_s
+    return priors.lag_at_s, within_s, max(2.0 * within_s, LOOKED_WITHIN_S)
 
 
-def _explains(base: State, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
+def _explains(base: State, records: Sequence[Record], limit: Limit) -> bool:
     """Whether the windows, taken one after the other, are all consistent with the state; at least one is used."""
-    trial, records = base, _records(found, day, lag_s, base)
+    trial = base
     for k, record in enumerate(records):
-        told, trial = trial.with_window(record, at_its_lag=k == 0)
+        told = trial.innovation(record, at_its_lag=k == 0)
         if told.statistic > limit(told.degrees_of_freedom):
             return False
+        if k + 1 < len(records):
+            trial = trial.with_window(record, at_its_lag=k == 0)[1]
     return bool(records)
 
 
-def _decisive(state: State, loose: State, found: Found, lag_s: float, day: float, limit: Limit) -> bool:
+def _decisive(state: State, loose: State, first: Record, limit: Limit) -> bool:
     """Whether the other lag alone makes the difference: chi-squared falls by more than one unknown does by chance."""
-    first = _records(found, day, lag_s, loose)[0]
     tight = state.innovation(first, at_its_lag=True).statistic
     return tight - loose.innovation(first, at_its_lag=True).statistic > limit(1.0)
-
-
-def _records(found: Found, day: float, lag_s: float, state: State) -> list[Record]:
-    told = lag_s, found.temperature_degc, state.reference, state.motion_to_hz
-    return [Record.of(window, day, *told) for window in found.used]
 
 
 def _too_far(lag_s: float, mean_s: float, u_s: float) -> str:

@@ -11,10 +11,20 @@ from agent.config import Channel
 from agent.core.schedule import Piece
 from agent.core.stream import DeviceStream
 from calib.excitation.bands import ABOVE, HIGHEST, motion_band_hz, share_above
-from calib.excitation.front_end import LEAST_MARGIN_S, Settings, Unusable, margin_s, nothing_in, windows_of
+from calib.excitation.front_end import (
+    LEAST_MARGIN_S,
+    Aligned,
+    Settings,
+    Unusable,
+    aligned,
+    margin_s,
+    nothing_in,
+    windows_of,
+)
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.model import Window
 from calib.signal.response import FLAT, Response
+from calib.signal.samples import Samples
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,17 +70,7 @@ def windows_in(
     taken to come late by `lag_s`, and to be what `response` makes of the motion. Motion above `to_hz` is filtered out.
     `limits` as `limits_of` gives them.
     """
-    start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
-    around_s = margin_of(channel, streams)
-    sensor = streams[channel.sensor].cut(start_s - 0.5 * around_s, stop_s + 0.5 * around_s)
-    if sensor is None:
-        return Found([refused(piece, f"no samples of {channel.sensor}")])
-    reference = None
-    if channel.reference is not None:
-        reference = streams[channel.reference].cut(start_s - around_s, stop_s + around_s)
-        if reference is None:
-            return Found([refused(piece, f"no samples of the reference {channel.reference}")])
-    span_s = start_s, stop_s
+    span_s = first_s + piece.start_s, first_s + piece.stop_s
 
     def made(limit_hz: float | None) -> list[Window]:
         settings = Settings(limits, bands=True, to_hz=limit_hz)
@@ -79,6 +79,7 @@ def windows_in(
         )  # fmt: skip
 
     try:
+        sensor, reference = _cut(span_s, channel, streams)
         found = made(None)
         if any(share_above(window.bands, HIGHEST * to_hz) > ABOVE for window in found):
             motion_hz = motion_band_hz(found, lasting=True)
@@ -89,6 +90,44 @@ def windows_in(
         return Found([refused(piece, "the samples of sensor and reference do not overlap in time")])
     found = [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
     return Found(found, sensor.temperature_degc)
+
+
+def aligned_in(
+    piece: Piece,
+    first_s: float,
+    channel: Channel,
+    streams: dict[str, DeviceStream],
+    lag_s: float,
+    response: Response = FLAT,
+    to_hz: float = np.inf,
+) -> Aligned | None:
+    """The samples of a stretch from which `windows_in` makes its windows, with the same parameters; None where there
+    is no reference beside them."""
+    span_s = first_s + piece.start_s, first_s + piece.stop_s
+    settings = Settings(to_hz=to_hz if np.isfinite(to_hz) else None)
+    try:
+        sensor, reference = _cut(span_s, channel, streams)
+    except Unusable:
+        return None
+    if reference is None:
+        return None
+    return aligned(sensor, reference, channel.instrument, span_s, lag_s, settings, response)
+
+
+def _cut(
+    span_s: tuple[float, float], channel: Channel, streams: dict[str, DeviceStream]
+) -> tuple[Samples, Samples | None]:
+    """The samples of sensor and reference between two times and around. Raises Unusable where there are none."""
+    around_s = margin_of(channel, streams)
+    sensor = streams[channel.sensor].cut(span_s[0] - 0.5 * around_s, span_s[1] + 0.5 * around_s)
+    if sensor is None:
+        raise Unusable(f"no samples of {channel.sensor}")
+    if channel.reference is None:
+        return sensor, None
+    reference = streams[channel.reference].cut(span_s[0] - around_s, span_s[1] + around_s)
+    if reference is None:
+        raise Unusable(f"no samples of the reference {channel.reference}")
+    return sensor, reference
 
 
 def limits_of(channel: Channel) -> Limits:

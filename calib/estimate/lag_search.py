@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array, Window
+from calib.signal.order_statistics import median
 
 TURNS = 4  # each iteration leaves about a thousandth of the lag
 BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the iterations lead to the lag
 # Limit of (omega lag)^3 / 6, the error of the window equations, which are of second order in the remaining lag.
 PHASE_LEFT = 1e-8
 AS_HIGH = 0.9  # of the highest peak of a correlation: peaks of motion with one frequency differ by less
+FINER = 4  # lags a sample: the fastest motion that resampling keeps turns by half a rad from one to the next
+SEGMENT_S = 2.0  # of samples that have one lag: a few cycles of the motion
+IntArray = NDArray[np.int64]
 Made = TypeVar("Made")
 
 
@@ -43,14 +49,70 @@ def without_lag(
         del made, windows  # of a day, they would need as much memory as those that follow
 
 
-def starts(low_s: float, high_s: float, windows: Sequence[Window]) -> list[float]:
-    """Lags in s from `low_s` to `high_s`, so dense that one of them is near enough to every lag between (BASIN_RAD).
+def misfit_by_lag(
+    V: Array, expected: Array, sample: IntArray, rate_hz: float, furthest_s: float
+) -> tuple[Array, Array]:
+    """How badly outputs fit what was expected of them, had they come later by each of L lags (L,) in s, which rise.
 
-    The `windows`, used or not, tell how fast the motion is. `without_lag` leads from the best of them to the lag.
+    V (n, 3) and `expected` (n, 3) are at the same times, the numbers (n,) of their samples at `rate_hz` rise. The lags
+    reach as far as `furthest_s` to both sides, but leave half of the time. The misfit (L,) is the mean square of what
+    is left, over the least of it, times the 3 n values: of white noise it rises by 1 one standard uncertainty away.
+    All lags follow from the same spectra.
     """
-    count = int(np.ceil((high_s - low_s) * max(largest_omega(windows), np.finfo(float).tiny) / (2.0 * BASIN_RAD)))
-    edges = np.linspace(low_s, high_s, max(count, 1) + 1)
-    return [float(lag_s) for lag_s in 0.5 * (edges[:-1] + edges[1:])]
+    n = int(sample[-1] - sample[0]) + 1
+    size = min(int(np.ceil(furthest_s * rate_hz)), n // 2)
+    length = 1 << (n + size).bit_length()
+    rows = np.zeros((9, n))
+    at = sample - sample[0]
+    rows[0, at] = 1.0
+    rows[1:4, at], rows[4:7, at] = (x.T - x.mean(axis=0)[:, None] for x in (V, expected))
+    rows[7], rows[8] = np.sum(rows[1:4] ** 2, axis=0), np.sum(rows[4:7] ** 2, axis=0)
+    there, out, moved, square, moved_square = np.split(np.fft.rfft(rows, length, axis=1), [1, 4, 7, 8])
+    left = square * there.conj() + there * moved_square.conj() - 2.0 * np.sum(out * moved.conj(), axis=0)
+    both = np.fft.irfft(np.vstack([left, there * there.conj()]), FINER * length, axis=1)
+    k = np.arange(-FINER * size, FINER * size + 1)
+    mean_square = both[0, k] / both[1, k]
+    least = max(float(mean_square.min()), np.finfo(float).tiny)
+    return k / (FINER * rate_hz), 3.0 * len(V) * mean_square / least
+
+
+def longest_in_time(
+    V: Array, expected: Array, time_s: Array, furthest_s: float, least_fall: float
+) -> tuple[float, float] | None:
+    """The longest stretch of outputs V (n, 3) that come when they are expected (n, 3), from one time in s to another;
+    None where all do, or none does.
+
+    Stretches of SEGMENT_S are looked at one by one. One of them comes at another lag, up to `furthest_s`, if it fits
+    half as badly there and the misfit (see `misfit_by_lag`) falls by `least_fall`. A sensitivity that changes, a knock
+    or noise do not look so. Beside a stretch at another lag, one more is left out: the lag may change within it.
+    """
+    rate_hz = 1.0 / float(median(np.diff(time_s)))
+    sample = np.rint((time_s - time_s[0]) * rate_hz).astype(np.int64)
+    edges = np.arange(0.0, max(time_s[-1] - time_s[0] - 0.5 * SEGMENT_S, SEGMENT_S), SEGMENT_S)
+    cuts = [*np.searchsorted(time_s, time_s[0] + edges).tolist(), len(time_s)]
+    off = np.zeros(len(cuts) - 1, dtype=bool)
+    for k, (a, b) in enumerate(itertools.pairwise(cuts)):
+        if b - a >= 0.5 * SEGMENT_S * rate_hz:
+            _, misfit = misfit_by_lag(V[a:b], expected[a:b], sample[a:b], rate_hz, furthest_s)
+            here, least = float(misfit[len(misfit) // 2]), float(misfit.min())
+            off[k] = least < 0.5 * here and here - least > least_fall
+    left = off | np.append(off[1:], False) | np.append(False, off[:-1])
+    if not off.any() or left.all():
+        return None
+    ends = np.flatnonzero(np.diff(left, prepend=True, append=True)).reshape(-1, 2)
+    first, stop = ends[np.argmax(ends[:, 1] - ends[:, 0])].tolist()
+    return float(time_s[cuts[first]]), float(time_s[cuts[stop] - 1])
+
+
+def minima(lags_s: Array, misfit: Array) -> tuple[Array, Array]:
+    """The lags (M,) in s and the values (M,) of the minima of a misfit (L,) at evenly spaced lags (L,), the deepest
+    first: those of the parabola through the lowest lag and its two neighbours."""
+    before, here, after = misfit[:-2], misfit[1:-1], misfit[2:]
+    k = np.flatnonzero((here < before) & (here <= after))
+    slope, bend = 0.5 * (after[k] - before[k]), after[k] - 2.0 * here[k] + before[k]
+    at_s, depth = lags_s[k + 1] - slope / bend * (lags_s[1] - lags_s[0]), here[k] - 0.5 * slope**2 / bend
+    order = np.argsort(depth, kind="stable")
+    return at_s[order], depth[order]
 
 
 def largest_omega(windows: Sequence[Window]) -> float:

@@ -9,8 +9,9 @@ after each 48 windows.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -170,9 +171,20 @@ class State:
 
     def with_window(self, record: Record, *, at_its_lag: bool = False) -> tuple[Innovation, Self]:
         """What the window says against the state at its time (see `innovation`), and a copy that has taken it."""
+        told, taken = self.tried(record, at_its_lag=at_its_lag)
+        return told, taken()
+
+    def tried(self, record: Record, *, at_its_lag: bool = False) -> tuple[Innovation, Callable[[], Self]]:
+        """As `with_window`, but the copy takes the window, which may mean to solve everything anew, when it is asked
+        for; it can be asked for once."""
         told, trial, used, ahead, rows = self._against(record, at_its_lag)
-        trial._take(used, ahead, rows)
-        return told, trial
+        return told, partial(trial._take, used, ahead, rows)
+
+    def lag_with(self, record: Record) -> float:
+        """The lag once a window is taken, by its equations linearised at the lag that was taken out of it."""
+        _, trial, record, ahead, rows = self._against(record, at_its_lag=True)
+        trial._now = ahead.with_window(record, rows)
+        return trial.lag_s
 
     def _against(self, record: Record, at_its_lag: bool) -> tuple[Innovation, Self, Record, Now, Array]:
         trial = self.copy()
@@ -601,11 +613,12 @@ class State:
             self._now = estimate([], self.statements, also=[record.day]).now
         return record, self._now.passed_to(record.day).meeting(record)
 
-    def _take(self, record: Record, ahead: Now, rows: Array) -> None:
+    def _take(self, record: Record, ahead: Now, rows: Array) -> Self:
         self._count(record)
         self._now = ahead.with_window(record, rows)
         if self._moved():
             self.solve()
+        return self
 
     def _count(self, record: Record) -> None:
         old, new = self._records[: 1 - SEVERAL], self._records[1 - SEVERAL :]

@@ -5,13 +5,17 @@ the phase of a poll, from the transport or from a stall of the program. So the m
 is a parabola below the points of the last minute (arrival time over sample number). The two earliest arrivals of each
 group of bursts give the group's point of that lower edge. The constant part of the delay (for example of a bus
 transfer) cannot be seen in the arrivals; it is part of the lag that the adjustment estimates.
+
+For seconds a busy bus may pass everything on late. Groups that are late together are left out as long as a quarter of
+the others is on time. It cannot be told whether such a delay that lasts until now will end: if it stays, samples were
+lost that nobody counted, or the delay is another one from now on, and the lag changes when the last minute has it.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -31,6 +35,11 @@ GROUPS, SMALLEST_GROUP, LARGEST_GROUP = 16, 8, 64
 CURVED_FROM_S = 20.0  # over a shorter time a straight line is more accurate: the curvature is too uncertain
 FEWEST_FOR_RATE = 20  # bursts; with fewer, the nominal rate is more accurate than an estimate
 
+# A group is late by more than LATE_S, and by more than LATE_SD of the scatter of groups, than the earliest quarter. A
+# clock that warms up departs from a straight line by 0.06 ms within the minute.
+LATE_S, LATE_SD, ON_TIME = 0.002, 12.0, 0.25
+FEWEST_ON_TIME = 4  # groups: a parabola has three unknowns
+
 Edge = Literal["early", "mean"]
 
 
@@ -41,7 +50,8 @@ class ClockFit:
     `knot_index`, `knot_time_s`, `knot_period_s` (K,): sample number, time (s) and sample period (s) at the knots.
     `index` is the newest sample; `rate_hz` is the rate and `offset_s` the time at that sample, `u_rate_hz`
     and `u_offset_s` their standard uncertainties, without the constant part of the delay. `gaps` are the sample numbers
-    before which samples are missing.
+    before which samples are missing. `late` (k, 2): first and last sample of bursts that arrived so late, for seconds,
+    that the clock does not follow from them.
     """
 
     knot_index: Array
@@ -53,6 +63,7 @@ class ClockFit:
     offset_s: float
     u_offset_s: float
     gaps: IntArray
+    late: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
 
     def time_of(self, index: ArrayLike) -> Array:
         """Times in s at which the samples with these numbers (n,) were taken; a number may have a fraction."""
@@ -206,6 +217,7 @@ class Parabola:
     time_s: float
     coefficients: Array  # (3,) s, s per sample, s per sample squared
     covariance: Array  # (3, 3)
+    late: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))  # as in ClockFit
 
     def at(self, index: ArrayLike) -> Array:
         """Time in s of these sample numbers (n,)."""
@@ -234,6 +246,7 @@ class Parabola:
             offset_s=float(self.at(last)),
             u_offset_s=float(np.sqrt(at_last @ self.covariance @ at_last)),
             gaps=np.empty(0, dtype=np.int64),
+            late=self.late,
         )
 
 
@@ -264,10 +277,34 @@ def parabola(index: IntArray, arrival_s: Array, nominal_rate_hz: float, edge: Ed
         at, value = _edges(
             x[-groups * size :].reshape(groups, size), late[-groups * size :].reshape(groups, size), edge
         )
-        change, spread = _robust_line(np.vander(at / scale[1], order, increasing=True), value)
+        on_time = _on_time(at, value) if edge == "early" else np.ones(groups, dtype=bool)
+        change, spread = _robust_line(np.vander(at[on_time] / scale[1], order, increasing=True), value[on_time])
         c[:order] += change / scale
         covariance[:order, :order] = spread / np.outer(scale, scale)
-    return Parabola(int(index[-1]), float(arrival_s[-1]), c, covariance)
+    late = _late_samples(index, y - (c[0] + x * (c[1] + x * c[2])), value[~on_time])
+    return Parabola(int(index[-1]), float(arrival_s[-1]), c, covariance, late)
+
+
+def _late_samples(index: IntArray, late: Array, by_s: Array) -> IntArray:
+    """(k, 2) the first and the last sample of bursts, late by (B,) in s, that are at least half as late as the latest
+    of the groups that were left out, late by (L,)."""
+    least_s = 0.5 * np.max(by_s, initial=0.0)
+    found = np.flatnonzero(late[1:] > least_s) if least_s > LATE_S else np.empty(0, dtype=np.int64)
+    return np.column_stack([index[found] + 1, index[found + 1]])
+
+
+def _on_time(at: Array, value: Array) -> NDArray[np.bool_]:
+    """Which groups of bursts, with their edges (G,) in s at sample numbers (G,), did not arrive late as a whole, and
+    have no such neighbour: the delay begins or ends within that one."""
+    if np.ptp(value) <= LATE_S:
+        return np.ones(len(value), dtype=bool)
+    # A delay that begins or ends is in few of the slopes of neighbours, wherever it is.
+    late = value - at * median((value[2:] - value[:-2]) / (at[2:] - at[:-2]))
+    usual = float(np.partition(late, int(ON_TIME * len(late)))[int(ON_TIME * len(late))])
+    scatter = 1.4826 * float(median(np.abs(np.diff(late)))) / np.sqrt(2.0)
+    off = np.abs(late - usual) > max(LATE_S, LATE_SD * scatter)
+    on_time = ~(off | np.append(off[1:], False) | np.append(False, off[:-1]))
+    return on_time if np.count_nonzero(on_time) >= max(FEWEST_ON_TIME, ON_TIME * len(late)) else np.ones_like(on_time)
 
 
 def _edges(x: Array, late: Array, edge: Edge) -> tuple[Array, Array]:

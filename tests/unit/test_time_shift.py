@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from agent.core import streams
 from agent.core.events import CalibrationUpdate, ClockReport, Event, Result, StatusChange, WindowReport
 from agent.core.pipeline import Pipeline
+from agent.core.schedule import Piece
+from agent.core.windows import Found, windows_in
 from benchmarks.online.node import Node, Stated, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, opened, visits
 from hw.block import BlockFlags, SampleBlock
@@ -17,6 +22,7 @@ from hw.virtual.harm import HARMLESS, Harm, Transformed
 
 WINDOWS, FROM = 9, 4  # windows of a run, and the first one after the shift
 U_LAG_S = 0.02
+TIMING = Timing(20.0, 60.0, WINDOWS)
 
 
 def site(seed: int = 1, harm: Harm = HARMLESS) -> Node:
@@ -26,20 +32,30 @@ def site(seed: int = 1, harm: Harm = HARMLESS) -> Node:
         harm=harm,
         harmed_from=FROM,
         stated=Stated(lag_s=U_LAG_S),
-        timing=Timing(20.0, 60.0, WINDOWS),
+        timing=TIMING,
     )
 
 
 def shifted(drawn: Node, device: str, shift_s: float, flags: BlockFlags = BlockFlags.NONE) -> Iterator[Event]:
     """The events of the building; from window FROM on the arrivals of one device are later by `shift_s`."""
-    since_s, by_ns, flagged = drawn.building.span(FROM)[0], round(shift_s * 1e9), flags
-    for event in visits(drawn.building, range(WINDOWS)):
-        if isinstance(event, SampleBlock) and event.device == device and event.t_monotonic_ns * 1e-9 >= since_s:
-            late_ns = event.burst_t_monotonic_ns + by_ns
-            yield replace(
-                event, burst_t_monotonic_ns=late_ns, t_utc_ns=event.t_utc_ns + by_ns, flags=event.flags | flagged
-            )
+    flagged = flags
+    for event in shifted_by(drawn, device, lambda visit: shift_s if visit >= FROM else 0.0):
+        late = event.t_monotonic_ns * 1e-9 >= drawn.building.span(FROM)[0]
+        if isinstance(event, SampleBlock) and event.device == device and late:
+            yield replace(event, flags=event.flags | flagged)
             flagged = BlockFlags.NONE
+        else:
+            yield event
+
+
+def shifted_by(drawn: Node, device: str, by_s: Callable[[int], float]) -> Iterator[Event]:
+    """The events of the building; the arrivals of one device in each visit are later by `by_s`."""
+    for event in visits(drawn.building, range(WINDOWS)):
+        if isinstance(event, SampleBlock) and event.device == device:
+            by_ns = round(1e9 * by_s(int(event.t_monotonic_ns * 1e-9 // TIMING.every_s)))
+            yield replace(
+                event, burst_t_monotonic_ns=event.burst_t_monotonic_ns + by_ns, t_utc_ns=event.t_utc_ns + by_ns
+            )
         else:
             yield event
 
@@ -47,6 +63,19 @@ def shifted(drawn: Node, device: str, shift_s: float, flags: BlockFlags = BlockF
 def fed(drawn: Node, events: Iterable[Event]) -> list[Result]:
     run = Run(drawn.config)
     return [result for event in events for result in run.feed(event)]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
+    """How many times the windows of each visit were made; they are made as ever."""
+    counts: Counter[int] = Counter()
+
+    def counted(piece: Piece, *args: Any) -> Found:
+        counts[int(piece.start_s // TIMING.every_s)] += 1
+        return windows_in(piece, *args)
+
+    monkeypatch.setattr(streams, "windows_in", counted)
+    return counts
 
 
 def windows(results: list[Result]) -> list[WindowReport]:
@@ -73,10 +102,13 @@ def off_u(drawn: Node, results: list[Result]) -> float:
         ("reference", 0.035, "sensor is stamped earlier than before, or reference later"),
     ],
 )
-def test_stamps_that_shift_are_found_and_told_and_every_window_is_taken(device: str, shift_s: float, said: str) -> None:
+def test_stamps_that_shift_are_found_and_told_and_every_window_is_taken(
+    device: str, shift_s: float, said: str, made: Counter[int]
+) -> None:
     drawn = site()
     results = fed(drawn, shifted(drawn, device, shift_s))
     assert [w.used for w in windows(results)] == [True] * WINDOWS
+    assert made[FROM] <= 3  # at the lag before, at the one that the cross-spectrum tells, and at a better one
     [told] = news(results)
     change_ms = 1e3 * (shift_s if device == "sensor" else -shift_s)
     assert said in told
@@ -98,11 +130,24 @@ def test_a_shift_beyond_what_is_stated_stays_held_and_says_what_to_state() -> No
     assert statuses[-1].status == "HELD" or "uncertainty.lag_s" in statuses[-1].reason
 
 
-def test_a_jump_of_the_sensitivity_is_no_shift() -> None:
+def test_a_jump_of_the_sensitivity_is_no_shift_and_no_other_lag_is_tried(made: Counter[int]) -> None:
     drawn = site(harm=Transformed("3 % more", "sensor", 1.03 * np.eye(3)))
     results = fed(drawn, visits(drawn.building, range(WINDOWS)))
     assert [w.used for w in windows(results)] == [True] * FROM + [False] * 4 + [True]  # the fifth confirms the jump
     assert not news(results)
+    assert [made[visit] for visit in range(FROM, FROM + 4)] == [1] * 4
+
+
+def test_a_lag_that_was_excluded_is_seldom_tried_again_but_another_one_at_once(made: Counter[int]) -> None:
+    drawn = site()
+    beyond_s = 4.0 * U_LAG_S + 0.01 - drawn.building.parameters.lag_s
+
+    def by_s(visit: int) -> float:
+        return 0.0 if visit < FROM else beyond_s if visit < WINDOWS - 1 else 0.03
+
+    fed(drawn, shifted_by(drawn, "sensor", by_s))
+    tried = [made[visit] > 1 for visit in range(FROM, WINDOWS)]
+    assert tried == [True, True, False, True, True]  # at one lag the first, the second and the fourth; then another
 
 
 def test_a_device_that_began_anew_is_named() -> None:

@@ -80,6 +80,34 @@ def test_seconds_of_a_busy_gateway_do_not_pull() -> None:
     assert np.abs(fit.time_of(index) - t[index]).max() < 150e-6
 
 
+@pytest.mark.parametrize("since_s", [0.0, 7.0, 25.0, 43.0, 50.0])
+@pytest.mark.parametrize(("rate_hz", "poll_s", "most_s"), [(1003.3, 0.020, 150e-6), (100.3, 0.32, 2e-3)])
+def test_ten_seconds_that_are_late_do_not_bend_the_clock(
+    since_s: float, rate_hz: float, poll_s: float, most_s: float
+) -> None:
+    t, index, arrival = polled(60.0, rate_hz, poll_s, seed=8)
+    late = (arrival > since_s) & (arrival < since_s + 10.0)
+    delayed = np.maximum.accumulate(arrival + np.where(late, 0.05, 0.0))
+    [(_, fit)] = followed((t, index, delayed), round(rate_hz, -2), np.array([61.0]))
+    [(_, sound)] = followed((t, index, arrival), round(rate_hz, -2), np.array([61.0]))
+    assert np.abs(fit.time_of(index) - t[index]).max() < most_s
+    assert len(sound.late) == 0
+    samples = int(np.sum(fit.late[:, 1] - fit.late[:, 0] + 1))
+    assert samples == pytest.approx(10.0 * rate_hz, abs=4 * rate_hz * poll_s)
+
+
+@pytest.mark.parametrize(("later_s", "follows_after_s"), [(0.05, 45.0), (-0.05, 15.0)])
+def test_a_delay_that_stays_is_the_usual_one_once_no_quarter_of_a_minute_is_earlier(
+    later_s: float, follows_after_s: float
+) -> None:
+    t, index, arrival = polled(120.0, 1003.3, 0.020, seed=9)
+    moved = np.maximum.accumulate(arrival + np.where(arrival > 60.0, later_s, 0.0))
+    for at_s, expected_s in ((follows_after_s - 5.0, 0.0), (follows_after_s + 5.0, later_s)):
+        [(_, fit)] = followed((t, index, moved), 1000.0, np.array([60.0 + at_s]))
+        held = index[(index > fit.index - 55_000) & (index <= fit.index)]
+        np.testing.assert_allclose(fit.time_of(held) - t[held], expected_s, atol=2e-3)
+
+
 def test_stated_uncertainty_is_of_the_size_of_the_scatter() -> None:
     # 60 independent minutes: the error's own sd, without its mean, within a factor 1.5 of what is stated.
     errors, stated = [], []

@@ -1,0 +1,96 @@
+"""How well an output fits the motion at any lag, from one cross-spectrum; the true lag is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.estimate.lag_search import longest_in_time, minima, misfit_by_lag
+
+RATE_HZ, SECONDS, NOISE = 100.0, 40.0, 0.05
+S = np.array([[2.0, 0.02, -0.01], [0.01, 1.9, 0.03], [0.0, 0.02, 2.1]])
+
+
+def motion(time_s: np.ndarray, seed: int, band_hz: tuple[float, float]) -> np.ndarray:
+    """(n, 3) m/s2: forty sines in the band for each axis, rms 1."""
+    rng = np.random.default_rng(seed)
+    omega = 2.0 * np.pi * rng.uniform(*band_hz, (3, 40))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (3, 40))
+    return np.asarray(np.sqrt(2.0 / 40.0) * np.sin(time_s[:, None, None] * omega + phase).sum(axis=2))
+
+
+def found(lag_s: float, seed: int, band_hz: tuple[float, float] = (0.5, 12.0), holes: bool = False) -> np.ndarray:
+    """The minima of the misfit within 0.15 s, the deepest first, of outputs that come late by `lag_s`."""
+    sample = np.arange(round(RATE_HZ * SECONDS))
+    if holes:
+        sample = np.delete(sample, np.r_[300:450, 2000:2003])
+    time_s = sample / RATE_HZ
+    expected = motion(time_s, seed, band_hz) @ S.T
+    V = motion(time_s - lag_s, seed, band_hz) @ S.T + [3.0, -1.0, 9.8]
+    V += NOISE * np.random.default_rng(seed + 1).normal(size=V.shape)
+    return np.column_stack(minima(*misfit_by_lag(V, expected, sample, RATE_HZ, 0.15)))
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.0123, -0.0371, 0.1404, -0.1404])
+@pytest.mark.parametrize("holes", [False, True])
+def test_the_deepest_minimum_is_at_the_lag(lag_s: float, holes: bool) -> None:
+    # u of the lag is the noise over the rms of dV/dt and the root of the number of values: 0.05 / (90 * 110) = 5 us.
+    errors = [found(lag_s, seed, holes=holes)[0, 0] - lag_s for seed in range(3)]
+    assert np.abs(errors).max() < 1e-4
+
+
+def test_beside_the_lag_the_misfit_is_that_of_noise_alone() -> None:
+    depths = [found(0.0125, seed)[:2, 1] for seed in range(3)]  # five lags of 2.5 ms
+    values = 3.0 * RATE_HZ * SECONDS
+    for deepest, next_one in depths:
+        assert deepest == pytest.approx(values, rel=0.02)
+        assert next_one > 100.0 * values  # the motion is 40 times the noise
+
+
+def test_of_one_frequency_each_period_is_a_minimum() -> None:
+    at_s = found(0.02, 1, (9.999, 10.001))[:3, 0]
+    np.testing.assert_allclose(np.sort(at_s), [-0.08, 0.02, 0.12], atol=1e-3)
+
+
+def outputs(lag_s: np.ndarray, seed: int = 1, size: np.ndarray | float = 1.0) -> tuple[np.ndarray, ...]:
+    """(V, expected, time) where each sample has a lag of its own and S is `size` times what is expected."""
+    time_s = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
+    V = size * (motion(time_s - lag_s, seed, (0.5, 12.0)) @ S.T)
+    noise = NOISE * np.random.default_rng(seed).normal(size=V.shape)
+    return V + noise, motion(time_s, seed, (0.5, 12.0)) @ S.T, time_s
+
+
+time_of_all_s = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
+
+
+@pytest.mark.parametrize("lag_s", [0.05, -0.05, 0.01])
+@pytest.mark.parametrize(
+    ("off_s", "longest_s"), [((0.0, 10.0), (10.0, 40.0)), ((14.5, 24.5), (24.5, 40.0)), ((31.0, 40.0), (0.0, 31.0))]
+)
+def test_the_longest_part_without_another_lag_is_found(
+    lag_s: float, off_s: tuple[float, float], longest_s: tuple[float, float]
+) -> None:
+    since_s, until_s = off_s
+    V, expected, time_s = outputs(np.where((time_of_all_s >= since_s) & (time_of_all_s < until_s), lag_s, 0.0))
+    found = longest_in_time(V, expected, time_s, 0.15, 50.0)
+    assert found is not None
+    assert longest_s[0] <= found[0] <= longest_s[0] + 4.0  # two stretches of 2 s at the most
+    assert longest_s[1] - 4.0 <= found[1] <= longest_s[1]
+
+
+def test_where_all_or_nothing_is_in_time_there_is_no_part() -> None:
+    assert longest_in_time(*outputs(np.zeros(len(time_of_all_s))), 0.15, 50.0) is None
+    assert longest_in_time(*outputs(np.full(len(time_of_all_s), 0.05)), 0.15, 50.0) is None
+
+
+def test_another_sensitivity_a_knock_and_a_stuck_output_are_no_other_lag() -> None:
+    middle = (time_of_all_s >= 14.5) & (time_of_all_s < 24.5)
+    assert (
+        longest_in_time(*outputs(np.zeros(len(time_of_all_s)), size=np.where(middle, 1.05, 1.0)[:, None]), 0.15, 50.0)
+        is None
+    )
+    V, expected, time_s = outputs(np.zeros(len(time_of_all_s)))
+    knocked = V + 20.0 * np.exp(-np.abs(time_of_all_s - 20.0) / 0.02)[:, None]
+    assert longest_in_time(knocked, expected, time_s, 0.15, 50.0) is None
+    stuck = np.where(middle[:, None], V[1450], V)
+    assert longest_in_time(stuck, expected, time_s, 0.15, 50.0) is None
