@@ -33,7 +33,7 @@ from tests.unit.test_estimation import estimation, hours
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 LEVELS, BEFORE, HELD = (0.1, 0.1, 0.1), 10, 5
-EYE = np.eye(3)
+EYE, MAIN, TRANSVERSE = np.eye(3), 0.01, 0.005  # scatter of S between sensors
 CASES: Mapping[str, Exchange] = {
     "range of the sensor doubled": Exchange(0.5 * EYE),
     "range of the sensor a quarter": Exchange(4.0 * EYE),
@@ -64,10 +64,10 @@ NONE: Mapping[str, Array] = {
 }
 
 
-def changed(random: np.random.Generator, cause: Exchange) -> Window:
-    """A window of a building after this change."""
+def changed(random: np.random.Generator, cause: Exchange, S: Array = S_TRUE) -> Window:
+    """A window of a building after this change of a sensor that has S (3, 3)."""
     turned = cause.matrix if cause.of == "mount" else EYE
-    window = building_window(random, level_mps2=LEVELS, S=S_TRUE @ turned)
+    window = building_window(random, level_mps2=LEVELS, S=S @ turned)
     by, sums = np.eye(9), window.sums
     if cause.of == "sensor":
         by[6:, 6:] = cause.matrix
@@ -77,17 +77,19 @@ def changed(random: np.random.Generator, cause: Exchange) -> Window:
     return replace(window, sums=replace(sums, mean=sums.mean @ by.T, scatter=scatter))
 
 
-def settled(random: np.random.Generator) -> Estimation:
-    """An estimation that has taken ten sound windows."""
+def settled(random: np.random.Generator, S: Array = S_TRUE) -> Estimation:
+    """An estimation that has taken ten sound windows of a sensor that has S (3, 3)."""
     found = estimation()
-    hours(found, [building_window(random, level_mps2=LEVELS) for _ in range(BEFORE)])
+    hours(found, [building_window(random, level_mps2=LEVELS, S=S) for _ in range(BEFORE)])
     return found
 
 
-def explained(found: Estimation, random: np.random.Generator, cause: Exchange, count: int = HELD) -> list[Exchange]:
+def explained(
+    found: Estimation, random: np.random.Generator, cause: Exchange, count: int = HELD, S: Array = S_TRUE
+) -> list[Exchange]:
     """The causes by which so many windows after this change are explained, in the order in which they are told."""
     at = found.lag_s, 20.0, found.state.reference, found.state.motion_to_hz
-    held = [Record.of(changed(random, cause), (BEFORE + k) / 24, *at) for k in range(count)]
+    held = [Record.of(changed(random, cause, S), (BEFORE + k) / 24, *at) for k in range(count)]
     told = exchanged(found.state, held, found.gate.limit)
     return [] if told is None else list(told.causes)
 
@@ -97,13 +99,15 @@ def table(seeds: int) -> str:
     counts, called = {name: Counter[str]() for name in CASES}, Counter[str]()
     for seed in range(seeds):
         random = np.random.default_rng(seed)
-        found = settled(random)
+        S = EYE + MAIN * np.diag(random.standard_normal(3)) + TRANSVERSE * random.standard_normal((3, 3))
+        found = settled(random, S)
         for name, case in CASES.items():
-            told = [c.of == case.of and np.array_equal(c.matrix, case.matrix) for c in explained(found, random, case)]
+            causes = explained(found, random, case, S=S)
+            told = [cause.of == case.of and np.array_equal(cause.matrix, case.matrix) for cause in causes]
             how = "first" if told[:1] == [True] else "alike" if any(told) else "other" if told else "none"
             counts[name][how] += 1
         for name, matrices in NONE.items():
-            called[name] += sum(bool(explained(found, random, Exchange(matrix))) for matrix in matrices)
+            called[name] += sum(bool(explained(found, random, Exchange(matrix), S=S)) for matrix in matrices)
     rows = ["| change | named first | as fitting alike | another one | none |", "| --- " * 5 + "|"]
     for name, n in counts.items():
         rows.append(f"| {name} | {' | '.join(str(n[how]) for how in ('first', 'alike', 'other', 'none'))} |")

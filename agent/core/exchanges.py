@@ -139,6 +139,8 @@ def explanation(found: Explained, channel: Channel, since: str, held: int, numbe
     """The explanation of so many held windows for an operator. `since`: the time of the change. `number` of the
     estimate that puts the change in force; None if there is none."""
     first, *others = [cause.told(channel) for cause in found.causes[:MOST_TOLD]]
+    if (more := len(found.causes) - MOST_TOLD) > 0:
+        others.append(f"{more} more")
     alike = f" As well fits: {'; '.join(others)}." if others else ""
     other = (
         f"{found.next_best:.3g} with the next other cause" if np.isfinite(found.next_best) else "no other cause is near"
@@ -155,9 +157,10 @@ def _remedy(causes: Sequence[Exchange], channel: Channel, number: int | None) ->
     back = f"Set {devices}{which} back to what it was; the next windows are then taken, and S and Q stay"
     if number is not None:
         return f"{back}. Or put the change in force: fieldcal command accept --sequence {number}"
-    turn = next((cause.matrix for cause in causes if cause.of == "mount"), None)
-    if turn is None or channel.rotation is None:
+    turns = [cause.matrix for cause in causes if cause.of == "mount"]
+    if len(turns) != 1 or channel.rotation is None:
         return back
+    (turn,) = turns
     stated = {"rotation": turn @ np.reshape(channel.rotation, (3, 3))}
     if channel.rotation_gravity_mps2 is not None and any(channel.rotation_gravity_mps2):
         stated["rotation_gravity_mps2"] = turn @ channel.rotation_gravity_mps2

@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 
 from calib.estimate.record import Record
+from calib.estimate.state import MOST_REFERENCES
 from calib.geometry import AXES
 from calib.model import Array
 
 FIRST = 24  # windows that are learnt: of fewer, the third largest number is no bound of what is usual
 LOW = 2  # so many of the bounds may be too low, and so many of the first windows too noisy
 IN_A_ROW = 3
-GROWN, SCATTERS = np.log(1.5), 4.0  # beyond what is usual: at least so much, and so many SDs of the first windows
+GROWN, SCATTERS = np.log(1.3), 4.0  # beyond what is usual: at least so much, and so many SDs of the first windows
 AGAIN = np.log(2.0)  # growth since the last message, for the next one
 KEPT = ("first", "usual", "newest", "grown")
-SAME_BAND = 1.02  # ratio of the upper ends of two bands in which noise is alike
 
 
 @dataclass(slots=True)
@@ -34,7 +34,6 @@ class Noise:
     `usual` (3,) by how much a sound one may exceed what is expected, `newest` (k, 3) by how much the newest ones do,
     and `grown` (3,) what was told of that."""
 
-    to_hz: float
     first: Array = field(default_factory=lambda: np.zeros((0, 4)))
     usual: Array = field(default_factory=lambda: np.full(3, np.inf))
     newest: Array = field(default_factory=lambda: np.zeros((0, 3)))
@@ -78,27 +77,22 @@ class NoiseWatch:
 
     def update(self, record: Record, scale: float) -> str:
         """The news of a window for the operator; "" if there is none. `scale`: output unit per m/s2."""
-        known = self._of.get(record.reference)
-        if known is None or not 1.0 / SAME_BAND < record.to_hz / known.to_hz < SAME_BAND:
-            known = self._of[record.reference] = Noise(record.to_hz)
         motion = float(np.sqrt(np.sum(record.slopes**2) / record.count))
-        if not motion > 0.0 or not (record.noise > 0.0).all():
+        density = record.noise / np.sqrt(record.independent)  # without filter: a narrower one passes less of it
+        if not 0.0 < motion < np.inf or not (np.isfinite(density) & (density > 0.0)).all():
             return ""
-        changed = known.update(float(np.log(motion)), np.log(record.noise))
-        return "; ".join(_told(AXES[k], record.noise[k] / scale, float(np.exp(more))) for k, more in changed)
+        known = self._of.pop(record.reference, None) or Noise()
+        self._of = dict([*self._of.items(), (record.reference, known)][-MOST_REFERENCES:])
+        changed = known.update(float(np.log(motion)), np.log(density))
+        return "; ".join(_told(AXES[k], density[k] / scale, float(np.exp(more))) for k, more in changed)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
-        return {
-            reference: {"to_hz": own.to_hz} | {name: getattr(own, name).copy() for name in KEPT}
-            for reference, own in self._of.items()
-        }
+        return {reference: {name: getattr(own, name).copy() for name in KEPT} for reference, own in self._of.items()}
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
-        self._of = {
-            reference: Noise(own["to_hz"], *(np.array(own[name]) for name in KEPT)) for reference, own in state.items()
-        }
+        self._of = {reference: Noise(*(np.array(own[name]) for name in KEPT)) for reference, own in state.items()}
 
 
 def _told(axis: str, noise_mps2: float, times: float) -> str:
