@@ -192,9 +192,10 @@ def _places(outputs: int) -> list[Array]:
 
 
 def _left(record: Record, S: Array) -> float:
-    """The part of a window's slopes that S (3, 3) alone does not explain, without lag and response."""
+    """The part of a window's slopes that S (3, 3) alone does not explain, without lag and response; 0 at rest."""
     moved = record.root[:, : record.pose.direction.shape[1]] @ (S @ record.pose.direction).T
-    return float(np.linalg.norm(record.slopes - moved) / np.linalg.norm(record.slopes))
+    size = float(np.linalg.norm(record.slopes))
+    return float(np.linalg.norm(record.slopes - moved)) / size if size else 0.0
 
 
 def _of_other_outputs(record: Record, back: Array, about: Array) -> Record:
