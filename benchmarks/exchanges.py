@@ -77,19 +77,24 @@ def changed(random: np.random.Generator, cause: Exchange, S: Array = S_TRUE) -> 
     return replace(window, sums=replace(sums, mean=sums.mean @ by.T, scatter=scatter))
 
 
-def settled(random: np.random.Generator, S: Array = S_TRUE) -> Estimation:
-    """An estimation that has taken ten sound windows of a sensor that has S (3, 3)."""
+def settled(random: np.random.Generator, S: Array = S_TRUE, windows: int = BEFORE) -> Estimation:
+    """An estimation that has taken sound windows of a sensor that has S (3, 3)."""
     found = estimation()
-    hours(found, [building_window(random, level_mps2=LEVELS, S=S) for _ in range(BEFORE)])
+    hours(found, [building_window(random, level_mps2=LEVELS, S=S) for _ in range(windows)])
     return found
+
+
+def record_of(found: Estimation, random: np.random.Generator, cause: Exchange, hour: int, S: Array = S_TRUE) -> Record:
+    """The record of a window after this change."""
+    at = found.lag_s, 20.0, found.state.reference, found.state.motion_to_hz
+    return Record.of(changed(random, cause, S), hour / 24, *at)
 
 
 def explained(
     found: Estimation, random: np.random.Generator, cause: Exchange, count: int = HELD, S: Array = S_TRUE
 ) -> list[Exchange]:
     """The causes by which so many windows after this change are explained, in the order in which they are told."""
-    at = found.lag_s, 20.0, found.state.reference, found.state.motion_to_hz
-    held = [Record.of(changed(random, cause, S), (BEFORE + k) / 24, *at) for k in range(count)]
+    held = [record_of(found, random, cause, BEFORE + k, S) for k in range(count)]
     told = exchanged(found.state, held, found.gate.limit)
     return [] if told is None else list(told.causes)
 

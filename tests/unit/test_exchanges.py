@@ -10,24 +10,25 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agent.core import explaining
 from agent.core.estimation import DAY_S, Estimation
 from agent.core.exchanges import Exchange
+from agent.core.hypotheses import possible_jump
 from agent.core.snapshot import pack, unpack
-from benchmarks.exchanges import BEFORE, CASES, EYE, LEVELS, changed, explained, settled
+from benchmarks.exchanges import BEFORE, CASES, EYE, LEVELS, changed, explained, record_of, settled
 from calib.model import Array
 from tests.building_windows import building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE
-from tests.unit.test_estimation import actions, estimation, hours
+from tests.unit.test_estimation import actions, channel_of, estimation, hours
 
 HELD = 3  # windows that confirm a change
 UTC_NS = 1_790_000_000_000_000_000  # 2026-09-21 14:13 UTC
-LATER_S = (BEFORE + HELD + 7) / 24 * DAY_S  # six hours after the first held window
 QUARTER = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # about z
 
 
 @cache
 def before() -> bytes:
-    return pack(settled(np.random.default_rng(1)).snapshot())
+    return pack(settled(np.random.default_rng(1), windows=4).snapshot())
 
 
 def again(state: bytes, **more: Any) -> Estimation:
@@ -121,13 +122,20 @@ def test_what_is_no_exchange_is_not_called_one(matrix: Array) -> None:
     assert explained(again(before()), np.random.default_rng(7), Exchange(matrix), count=2) == []
 
 
-def test_of_a_dead_output_nothing_is_advised_that_would_be_refused() -> None:
-    """It shows noise, and a hundredth of the motion."""
-    found, told = held(Exchange(np.diag([0.01, 1.0, 1.0])))
-    assert told == ""
-    assert not found.gate.snapshot()["proposals"]
-    told = found.explain(LATER_S, UTC_NS)
-    assert "output x is dead: its largest sensitivity is " in told
-    assert "check the wiring of this output" in told
-    assert "accept" not in told
-    assert " or more" not in told
+@pytest.mark.parametrize(
+    ("cause", "words", "not_advised"),
+    [
+        # Noise, and a hundredth of the motion.
+        (Exchange(np.diag([0.01, 1.0, 1.0])), "output x is dead: its largest sensitivity is 0.01", "accept"),
+        # The certificate may state 50 % at most.
+        (Exchange(1.6 * EYE, "reference"), "another reference sensitivity (reference_", "u_sensitivity_pct"),
+    ],
+    ids=["dead", "60 %"],
+)
+def test_nothing_is_advised_that_would_be_refused(cause: Exchange, words: str, not_advised: str) -> None:
+    found = again(before())
+    record = record_of(found, np.random.default_rng(8), cause, BEFORE)
+    jump = possible_jump(found.state, [record])
+    told = explaining.explained(found.state, [record], jump, found.gate, channel_of(), None)
+    assert words in told
+    assert not_advised not in told
