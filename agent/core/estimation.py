@@ -112,7 +112,7 @@ class Estimation:
         self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
         self._tried: Tried | None = None  # what `after` did, for `judge` right after it
         self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
-        self._exchanged = False  # held windows show exchanged or rescaled outputs
+        self._exchanged = False  # held windows show exchanged or rescaled outputs, and this was told
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
 
     def use(self, place: int) -> None:
@@ -245,12 +245,12 @@ class Estimation:
 
     def _confirmed(self, held: Sequence[Record]) -> tuple[State | None, str, bool]:
         """The state that as many held windows as confirm a jump ask for, which device has changed, and whether outputs
-        were exchanged or rescaled, which is looked for once and told at once."""
-        confirm, limit = self._channel.gate.confirm_windows, self.gate.limit
-        if len(held) < confirm or self.lag_watch.beyond:
+        were exchanged or rescaled, which is looked for until it is found, and told at once."""
+        limit = self.gate.limit
+        if len(held) < self._channel.gate.confirm_windows or self.lag_watch.beyond:
             return None, "", False
         adopted, who = confirmed(self.state, held, self._devices, limit)
-        if self.gate.held != confirm - 1 or (found := exchanged(self.state, held, limit)) is None:
+        if self._exchanged or (found := exchanged(self.state, held, limit)) is None:
             return adopted, who, False
         if found.scale is not None:
             return rescaled(self.state, held, found.scale, limit) or adopted, who, True

@@ -37,10 +37,11 @@ def again(state: bytes, **more: Any) -> Estimation:
     return found
 
 
-def held(cause: Exchange) -> tuple[Estimation, str]:
-    """The estimation after three held windows, and what it tells at the next tick."""
+def held(*causes: Exchange) -> tuple[Estimation, str]:
+    """The estimation after held windows, and what it tells at the next tick."""
     found, random = again(before()), np.random.default_rng(2)
-    for k, judged in enumerate(hours(found, [changed(random, cause) for _ in range(HELD)], first=BEFORE)):
+    first = BEFORE + HELD - len(causes)
+    for k, judged in enumerate(hours(found, [changed(random, cause) for cause in causes], first=first)):
         assert judged.decision.action == "hold"
         if judged.decision.proposal is not None:
             found.gate.published(100 + k)
@@ -53,7 +54,7 @@ def after(found: Estimation, windows: list[Any]) -> list[str]:
 
 def test_another_range_is_named_at_once_and_both_that_is_advised_ends_it() -> None:
     doubled = Exchange(2.0 * EYE)
-    found, told = held(doubled)
+    found, told = held(Exchange(1.5 * EYE), *[doubled] * HELD)  # the first window saw both ranges
     # The first held window ends three hours before the tick.
     assert told.startswith(
         "3 held windows show one change, since 2026-09-21 11:13 UTC at the latest: all outputs of s are 2 times what "
@@ -88,7 +89,7 @@ def test_another_range_is_named_at_once_and_both_that_is_advised_ends_it() -> No
 
 def test_a_sensor_that_was_turned_on_its_mount_goes_on_with_the_rotation_that_is_advised() -> None:
     turned = Exchange(QUARTER, "mount")
-    found, told = held(turned)
+    found, told = held(*[turned] * HELD)
     assert "s was turned on its mount, so that x shows what y showed, y shows minus what x showed" in told
     keys = dict(re.findall(r"(rotation\w*) = (\[[^]]*\])", told))
     stated: dict[str, Any] = {key: [float(x) for x in value[1:-1].split(",")] for key, value in keys.items()}
