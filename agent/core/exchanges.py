@@ -158,7 +158,8 @@ def _remedy(causes: Sequence[Exchange], channel: Channel, number: int | None) ->
     if number is not None:
         return f"{back}. Or put the change in force: fieldcal command accept --sequence {number}"
     turns = [cause.matrix for cause in causes if cause.of == "mount"]
-    if len(turns) != 1 or channel.rotation is None:
+    check = channel.check_reference
+    if len(turns) != 1 or channel.rotation is None or (check is not None and check.rotation is not None):
         return back
     (turn,) = turns
     stated = {"rotation": turn @ np.reshape(channel.rotation, (3, 3))}

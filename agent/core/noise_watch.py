@@ -23,7 +23,7 @@ from calib.model import Array
 FIRST = 24  # windows that are learnt: of fewer, the third largest number is no bound of what is usual
 LOW = 2  # so many of the bounds may be too low, and so many of the first windows too noisy
 IN_A_ROW = 3
-GROWN, SCATTERS = np.log(1.3), 4.0  # beyond what is usual: at least so much, and so many SDs of the first windows
+GROWN, SCATTERS = np.log(1.5), 4.0  # beyond what is usual: at least so much, and so many SDs of the first windows
 AGAIN = np.log(2.0)  # growth since the last message, for the next one
 KEPT = ("first", "usual", "newest", "grown")
 
