@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config.gate import GateSettings
+from calib.estimate.axes import axis_warnings, sensitivity_reasons
 from calib.model import PARAMETERS, Array, Calibration
 
 COVERAGE_FACTOR = 2.0  # a limit is never narrower than U = 2 u of the anchor
@@ -39,12 +40,8 @@ class Anchor:
         self._settings = settings
         self._value = _values(calibration)
         self._u = calibration.standard_uncertainty
-        usable = np.isfinite(self._value).all() and self._value[MAIN].all()
-        if not usable or np.linalg.matrix_rank(calibration.sensitivity) < 3:
-            raise ValueError(
-                "the calibration cannot be used as a start: S and Q must be finite, S must have an inverse, "
-                "and no main sensitivity may be 0"
-            )
+        if wrong := _no_start(calibration):
+            raise ValueError(wrong)
         self._fixed = self._expanded() <= self._max_change()
 
     @property
@@ -75,6 +72,14 @@ class Anchor:
         self._turned(calibration, numbers, reasons)
         self._off_sheet(value, numbers, reasons)
         return Change(f"S or Q changed by more than max_change: {', '.join(reasons)}" if reasons else "", numbers)
+
+    def refusal(self, calibration: Calibration) -> str:
+        """Why a calibration must not be proposed to an operator: it is not usable, an output is dead, or axes are
+        exchanged or inverted that were not so before; "" if it can be proposed."""
+        found = sensitivity_reasons(calibration, COVERAGE_FACTOR, stated=True)
+        if not found and not axis_warnings(self._value[:9].reshape(3, 3)):
+            found = axis_warnings(calibration.sensitivity)
+        return found[0] if found else _no_start(calibration)
 
     def limits(self) -> Array:
         """(12,) the largest allowed change of each parameter; inf for an offset that has no limit."""
@@ -137,6 +142,17 @@ def rotation_rad(sensitivity: Array, before: Array) -> float:
         return float(np.pi)
     skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     return float(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0))
+
+
+def _no_start(calibration: Calibration) -> str:
+    """Why changes cannot be counted from a calibration; "" if they can."""
+    usable = np.isfinite(_values(calibration)).all() and np.diag(calibration.sensitivity).all()
+    if usable and np.linalg.matrix_rank(calibration.sensitivity) == 3:
+        return ""
+    return (
+        "the calibration cannot be used as a start: S and Q must be finite, S must have an inverse, and no main "
+        "sensitivity may be 0"
+    )
 
 
 def _values(calibration: Calibration) -> NDArray[np.float64]:

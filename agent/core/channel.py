@@ -201,7 +201,9 @@ class ChannelState:
         return self._lose(f"no block of {self.sensor} for more than {self._channel.silence_s:g} s")
 
     def _explain(self) -> list[Result]:
-        found = "" if self._estimation is None else self._estimation.explain(self._first_day * DAY_S + self._time.now_s)
+        if self._estimation is None:
+            return []
+        found = self._estimation.explain(self._first_day * DAY_S + self._time.now_s, self._time.utc_ns)
         return [self._told(found)] if found else []
 
     def _say_status(self, reason: str) -> list[Result]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from agent.config import Channel
+from agent.core.exchanges import Explained, exchanged, explanation
 from agent.core.explaining import explained, most_likely
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
-from agent.core.hypotheses import Devices, confirmed, possible_jump, tilt_rad
+from agent.core.hypotheses import Devices, confirmed, possible_jump, rescaled, tilt_rad
+from agent.core.noise_watch import NoiseWatch
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
 from calib.estimate.axes import LEAST_S, where_nothing_moved
@@ -31,6 +34,7 @@ from calib.signal.response import Response
 
 DAY_S = 86400.0
 SAME_BUDGET = 1e-9  # of a variance: to which the squares of a budget add up
+NEAR = 0.1  # of its largest element, to which S is about another one
 SAME = 1e-6  # standard uncertainties: what rounding moves when the windows are taken again
 
 
@@ -38,8 +42,8 @@ SAME = 1e-6  # standard uncertainties: what rounding moves when the windows are 
 class Judged:
     """The result for a window: the decision of the gate, the innovation, and drift verdicts that changed.
 
-    `news` for the operator: that the time between sensor and reference has shifted, or which band and frequency are
-    settled; otherwise "".
+    `news` for the operator: that the noise has grown, that the time between sensor and reference has shifted, or which
+    band and frequency are settled; otherwise "".
     """
 
     decision: Decision
@@ -107,12 +111,14 @@ class Estimation:
         self.in_force, self.law = self.state.result(), self.state.law()
         self.residual_sd = self.state.residual_sd
         self.gate = Gate(channel.gate.filled(self.state.scale, fixed_mount=fixed), self.in_force)
+        self.noise = NoiseWatch()
         self.drift, self.walks = DriftTest(channel.drift.settings()), Walks(channel.drift.of_one_test)
         self._held: list[Record] = []
         self._proposed: list[Proposal] = []
         self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
         self._tried: Tried | None = None  # the newest window, for what is asked of it next
         self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
+        self._exchanged = False  # held windows show exchanged or rescaled outputs, and this was told
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
 
     def use(self, place: int) -> None:
@@ -196,10 +202,9 @@ class Estimation:
             tried = Tried(window.sums, record, *self.state.tried(record, at_its_lag=True))
         self._tried = None
         record, innovation, trial = tried.record, tried.innovation, tried.after
-        candidate, confirm = trial.result(), self._channel.gate.confirm_windows
-        held = [*self._held, record][-confirm:]
-        agree = len(held) == confirm and not self.lag_watch.beyond
-        adopted, who = confirmed(self.state, held, self._devices, self.gate.limit) if agree else (None, "")
+        noise_news = self.noise.update(record, self.state.scale)
+        candidate, held = trial.result(), [*self._held, record][-self._channel.gate.confirm_windows :]
+        adopted, who, at_once = self._confirmed(held)
         same = not self._held or any(held_one.reference == record.reference for held_one in self._held)
         enough = trial.windows > 1 or window.stop_s - window.start_s >= LEAST_S
         evidence = Evidence(
@@ -219,8 +224,12 @@ class Estimation:
             decision = replace(decision, reason=f"{decision.reason}{who}")
         kept = held if decision.action == "hold" else self._held
         self._held = kept[-self.gate.held :] if self.gate.held else []
-        if self._explain_s is None and self._held:
-            self._explain_s = evidence.t_s + self._channel.gate.explain_after_s
+        if self._held and (at_once or self._explain_s is None):
+            self._explain_s = evidence.t_s + (0.0 if at_once else self._channel.gate.explain_after_s)
+        self._exchanged |= at_once
+        if self._exchanged and not self.gate.held:  # the exchange is over: what it showed is no drift
+            self._exchanged = False
+            self.drift.restart(np.ones(12, dtype=bool))
         if decision.action in ("take", "hold"):
             found = self.drift.update(day * DAY_S, innovation.score, innovation.information)
             told += [v for v in found if v.verdict != "stable" or v.parameter not in self.walks.drifting]
@@ -237,7 +246,21 @@ class Estimation:
                 self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
             why = self.lag_watch.beyond or most_likely(innovation, self.state.scale)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
-        return Judged(decision, innovation, told, self._news(earlier) if decision.action in ("take", "adopt") else "")
+        news = (noise_news, self._news(earlier) if decision.action in ("take", "adopt") else "")
+        return Judged(decision, innovation, told, "; ".join(filter(None, news)))
+
+    def _confirmed(self, held: Sequence[Record]) -> tuple[State | None, str, bool]:
+        """The state that as many held windows as confirm a jump ask for, which device has changed, and whether outputs
+        were exchanged or rescaled, which is looked for until it is found, and told at once."""
+        limit = self.gate.limit
+        if len(held) < self._channel.gate.confirm_windows or self.lag_watch.beyond:
+            return None, "", False
+        adopted, who = confirmed(self.state, held, self._devices, limit)
+        if self._exchanged or (found := exchanged(self.state, held, limit)) is None:
+            return adopted, who, False
+        if found.scale is not None:
+            return rescaled(self.state, held, found.scale, limit) or adopted, who, True
+        return adopted, who, True
 
     def _news(self, earlier: State) -> str:
         """What the newest window, which was taken, has changed besides S and Q."""
@@ -254,10 +277,11 @@ class Estimation:
             self._tried = None
         return told, whole
 
-    def explain(self, now_s: float) -> str:
-        """What explains the held windows, once in each `explain_after_s` while there are any; else "".
+    def explain(self, now_s: float, utc_ns: int) -> str:
+        """What explains the held windows, once in each `explain_after_s` while there are any, and at once where outputs
+        were exchanged or rescaled; else "".
 
-        `now_s` counts as the days of `judge`.
+        `now_s` counts as the days of `judge`, `utc_ns` is UTC then.
         """
         if not self.gate.held or not self._held:
             self._explain_s = None
@@ -266,8 +290,30 @@ class Estimation:
         self._explain_s = now_s + self._channel.gate.explain_after_s
         if self.lag_watch.beyond:
             return f"the held windows show another lag: {self.lag_watch.beyond}"
-        jump, fixed = possible_jump(self.state, self._held), self._channel.fixed_mount
-        return explained(self.state, self._held, jump, self.gate.limit, fixed_mount=fixed)
+        if (found := exchanged(self.state, self._held, self.gate.limit)) is not None:
+            return self._exchange(found, utc_ns * 1e-9 - now_s)
+        jump, number = possible_jump(self.state, self._held), self._acceptable()
+        return explained(self.state, self._held, jump, self.gate, self._channel, number)
+
+    def _exchange(self, found: Explained, origin_utc_s: float) -> str:
+        """Outputs that were exchanged or rescaled, in words. `origin_utc_s`: UTC where the days of `judge` begin."""
+        first, number = self._held[0], None
+        if found.scale is not None:
+            number = self._acceptable(found.scale * self.state.result().sensitivity)
+        since = datetime.fromtimestamp(origin_utc_s + first.day * DAY_S, UTC).strftime("%Y-%m-%d %H:%M UTC")
+        beside = self._beside[self.state.statements.places.get(first.reference, 0)]
+        return explanation(found, beside, since, len(self._held), number)
+
+    def _acceptable(self, near: Array | None = None) -> int | None:
+        """The number of the newest estimate from held windows that an operator can accept, None if there is none. If
+        `near` (3, 3) is named, S must be about as it says."""
+        days = {record.day for record in self._held}
+        for made in reversed(self._proposed):
+            S = made.calibration.sensitivity
+            alike = near is None or float(np.abs(S - near).max()) <= NEAR * float(np.abs(near).max())
+            if alike and days & {record.day for record in made.records}:
+                return self.gate.number_of(made.calibration)
+        return None
 
     def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
         """The window tried on the state; the newest one is not tried again."""
@@ -416,12 +462,14 @@ class Estimation:
             "gate": self.gate.snapshot(),
             "drift": self.drift.snapshot(),
             "walks": self.walks.snapshot(),
+            "noise": self.noise.snapshot(),
             "held": [record.snapshot() for record in self._held],
             "proposed": [proposal.snapshot() for proposal in self._proposed],
             "in_force": fields_of(self.in_force),
             "law": {name: getattr(self.law, name) for name in Law.__slots__},
             "residual_sd": self.residual_sd,
             "lag_watches": [watch.snapshot() for watch in self._lag_watches],
+            "exchanged": self._exchanged,
             "explain_s": self._explain_s,
         }
 
@@ -435,10 +483,11 @@ class Estimation:
         self.gate.load(state["gate"])
         self.drift.load(state["drift"])
         self.walks.load(state["walks"])
+        self.noise.load(state["noise"])
         self._held = [Record.load(record) for record in state["held"]]
         self._proposed = [Proposal.load(proposal) for proposal in state["proposed"]]
         self.in_force, self.law = Calibration(**state["in_force"]), Law(**state["law"])
         self.residual_sd = np.array(state["residual_sd"])
-        self._explain_s = state["explain_s"]
+        self._exchanged, self._explain_s = state["exchanged"], state["explain_s"]
         for watch, kept in zip(self._lag_watches, state["lag_watches"], strict=False):
             watch.load(kept)

@@ -10,8 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import ValidationError
 
-from agent.core.gate import Limit
+from agent.config import Channel
+from agent.core.gate import Gate
 from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
@@ -31,17 +33,16 @@ UNITS: Mapping[str, tuple[str, float]] = {
 }
 WORTH = 3.0  # an explanation that makes chi-squared smaller by less explains nothing
 
-ACCEPT = (
-    "put the newest estimate in force: fieldcal command accept --sequence N (if there is none, the windows do not "
-    "agree on one change yet)"
-)
+COMPARE = "Compare devices and mount with the configuration"
+NOT_AGREED = "no estimate can be put in force, since the windows do not agree on one change yet"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explanation:
     """One line of the budget set free: chi-squared of the held windows, and its unknowns by their place in the state.
 
-    `most` is the unknown of this line that changes most (over its uncertainty), `change` by how much.
+    `most` is the unknown of this line that changes most (over its uncertainty), `change` by how much. `unfit`: why S
+    and Q that follow may not be put in force.
     """
 
     line: str
@@ -49,6 +50,7 @@ class Explanation:
     members: frozenset[int]
     most: Quantity
     change: float
+    unfit: str = ""
 
     @property
     def score(self) -> float:
@@ -56,11 +58,15 @@ class Explanation:
         return self.chi2 + AN_UNKNOWN * len(self.members)
 
 
-def explained(state: State, held: Sequence[Record], jump: Array, limit: Limit, *, fixed_mount: bool) -> str:
+def explained(
+    state: State, held: Sequence[Record], jump: Array, gate: Gate, channel: Channel, number: int | None
+) -> str:
     """The explanation that fits the held windows best, for an operator.
 
-    `jump` (12,) sets S and Q free, 0 where the windows tell nothing of them.
+    `jump` (12,) sets S and Q free, 0 where the windows tell nothing of them. `number` of the newest estimate from held
+    windows that can be accepted, None if there is none.
     """
+    limit, fixed_mount = gate.limit, channel.fixed_mount
     alone = state.chi2_beside(held)
     before = state.after(held, {}).chi2 - alone
     sound = limit(sum(record.rows for record in held))
@@ -68,14 +74,19 @@ def explained(state: State, held: Sequence[Record], jump: Array, limit: Limit, *
         f"{len(held)} held windows contradict the state: chi-squared {before:.0f}, {sound:.0f} at most if it is right."
     )
     found = sorted(
-        (_with(state, held, jump, line, members, alone) for line, members in _lines(state, jump, fixed_mount).items()),
+        (
+            _with(state, held, jump, gate, line, members, alone)
+            for line, members in _lines(state, jump, fixed_mount).items()
+        ),
         key=lambda e: e.score,
     )
     if not found or before < WORTH * found[0].chi2:
-        return f"{said} No known explanation fits them. Compare devices and mount with the configuration"
+        return f"{said} No known explanation fits them. {COMPARE}"
     # Of those that fit alike, the one with the fewest unknowns: a mount that turned is also a change of all S.
     best = min((e for e in found if e.score < found[0].score + DECISIVE), key=lambda e: len(e.members))
     fits = "Best fits" if best.chi2 <= sound else "Nearest, though not within what chance allows, is"
+    # Of another filter, only windows tell all that were made for it.
+    helps = best.chi2 <= sound or best.most.kind is RESPONSE
     alike = [
         _told(e, state.scale)
         for e in found
@@ -84,7 +95,8 @@ def explained(state: State, held: Sequence[Record], jump: Array, limit: Limit, *
     others = f" As well fits: {'; '.join(alike)}." if alike else ""
     return (
         f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}, {before / best.chi2:.3g} times "
-        f"smaller.{others} {_remedy(best, state.scale, fixed_mount)}"
+        f"smaller.{others} "
+        f"{_remedy(best, state.scale, channel, number) if helps else best.unfit or COMPARE}"
     )
 
 
@@ -110,7 +122,7 @@ def _lines(state: State, jump: Array, fixed_mount: bool) -> dict[str, list[int]]
 
 
 def _with(
-    state: State, held: Sequence[Record], jump: Array, line: str, members: Sequence[int], alone: float
+    state: State, held: Sequence[Record], jump: Array, gate: Gate, line: str, members: Sequence[int], alone: float
 ) -> Explanation:
     quantities = state.quantities
     u = np.zeros(len(quantities))
@@ -125,7 +137,7 @@ def _with(
     own = [quantities[k] for k in members if quantities[k].kind is quantities[members[0]].kind]
     moved = [_moved(state, after, quantity) for quantity in own]
     most = int(np.argmax([abs(change) / u_after for change, u_after in moved]))
-    return Explanation(line, chi2, frozenset(members), own[most], moved[most][0])
+    return Explanation(line, chi2, frozenset(members), own[most], moved[most][0], gate.refusal(after.result()))
 
 
 def _moved(before: State, after: State, quantity: Quantity) -> tuple[float, float]:
@@ -145,22 +157,38 @@ def _told(explanation: Explanation, scale: float) -> str:
     return f"another {explanation.line} ({explanation.most.name} {size})"
 
 
-def _remedy(best: Explanation, scale: float, fixed_mount: bool) -> str:
-    """What the operator can do."""
-    kind = best.most.kind
+def _remedy(best: Explanation, scale: float, channel: Channel, number: int | None) -> str:
+    """What the operator can do; never what a command or the configuration would refuse."""
+    kind, fixed_mount = best.most.kind, channel.fixed_mount
+    accept = best.unfit or NOT_AGREED
+    if number is not None and not best.unfit:
+        accept = f"put the change in force: fieldcal command accept --sequence {number}"
     if kind is OFFSET and fixed_mount:
         lean_deg = np.rad2deg(abs(best.change) / (scale * STANDARD_GRAVITY_MPS2))
-        return f"A mount that leans by {lean_deg:.2g} deg does the same: level it, or {ACCEPT}"
+        return f"A mount that leans by {lean_deg:.2g} deg does the same: level it. Otherwise: {accept}"
     if kind is RESPONSE:
         return (
             "A filter was set anew, or the mount came loose: set it back, tighten the mount, or state another "
             "prior.reference_frequency_hz, which begins the estimation again"
         )
     if "jump" in kind.loosened_by:
-        return f"If the reference is sound, {ACCEPT}"
+        return f"If the reference is sound: {accept}"
     assert kind.prior is not None  # see `_lines`
-    least = abs(best.change) / kind.prior.convert(1.0)
-    return f"Correct it in the configuration, or set {' or '.join(_settings(kind, fixed_mount))} to {least:.2g} or more"
+    least = f"{abs(best.change) / kind.prior.convert(1.0):.2g}"
+    settings = [one for one in _settings(kind, fixed_mount) if _may_be(channel, one, float(least))]
+    wider = f", or set {' or '.join(settings)} to {least} or more" if settings else ""
+    return f"Correct it in the configuration{wider}"
+
+
+def _may_be(channel: Channel, setting: str, value: float) -> bool:
+    """Whether the configuration allows the value of a setting, as section.field."""
+    section, field = setting.split(".")
+    stated = getattr(channel, section)
+    try:
+        type(stated).model_validate(stated.model_dump() | {field: value})
+    except ValidationError:
+        return False
+    return True
 
 
 def _settings(kind: Kind, fixed_mount: bool) -> tuple[str, ...]:

@@ -197,8 +197,8 @@ class Gate:
         )
 
     def _beyond(self, calibration: Calibration, change: Change, numbers: dict[str, float]) -> Decision:
-        if wrong := unusable(calibration, COVERAGE_FACTOR):
-            return self._decision("hold", f"{change.reason}; {wrong[0]}", numbers | change.numbers)
+        if wrong := self.refusal(calibration):
+            return self._decision("hold", f"{change.reason}; {wrong}", numbers | change.numbers)
         reason = f"{change.reason}; held until an operator accepts it"
         return self._decision("hold", reason, numbers | change.numbers, proposal=calibration)
 
@@ -259,6 +259,15 @@ class Gate:
         k = next(k for k, (number, _) in enumerate(self._proposals) if not number)
         self._proposals[k] = (sequence, self._proposals[k][1])
         self._proposals = self._proposals[-PROPOSALS_KEPT:]
+
+    def refusal(self, calibration: Calibration) -> str:
+        """Why a calibration must not be proposed to an operator, see Anchor.refusal; "" if it can be."""
+        return self._anchor.refusal(calibration)
+
+    def number_of(self, proposal: Calibration) -> int | None:
+        """The number with which an operator can accept a proposal; None if it has none."""
+        same = (number for number, own in self._proposals if np.array_equal(own.covariance, proposal.covariance))
+        return next(same, 0) or None
 
     def anchor_at(self, accepted: Calibration, in_force: Calibration) -> str:
         """Count changes from another calibration, which the configuration states now. Returns "" if that is done.

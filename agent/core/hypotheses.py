@@ -84,6 +84,13 @@ def confirmed(state: State, held: Sequence[Record], devices: Devices, limit: Lim
     return _of_either(state, held, sensor, devices.stability, limit, before), told
 
 
+def rescaled(state: State, held: Sequence[Record], factor: float, limit: Limit) -> State | None:
+    """The state after held windows that show all outputs of the sensor at another scale; None if they do not agree."""
+    wider = max(1.0, WIDER * abs(factor - 1.0) / JUMP_SENSITIVITY)
+    tried = _tried(state, held, _of_sensor(state, held, wider=wider), limit, state.chi2_beside(held))
+    return tried.state if tried.fits else None
+
+
 def _of_sensor(state: State, held: Sequence[Record], leaning_rad: float = 0.0, wider: float = 1.0) -> dict[str, float]:
     """A line that was plugged anew may be late by another time; that is no change of S or Q."""
     return state.changes(wider * possible_jump(state, held), leaning_rad, line=True, another_filter=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.config import parse_config
+from agent.config import Channel, parse_config
 from agent.core.estimation import Estimation, Judged
 from agent.core.snapshot import pack, unpack
 from calib.model import Window
@@ -25,7 +25,7 @@ CERTIFICATE = {
 OF_Y = S_TRUE * np.array([1.0, 1.03, 1.0])  # within max_change, far beyond the noise of a window
 
 
-def estimation(**more: Any) -> Estimation:
+def channel_of(**more: Any) -> Channel:
     devices = [{"name": n, "driver": "serial-csv", "options": {"port": n, "rate_hz": 50.0}} for n in "sr"]
     channel: dict[str, Any] = {
         "sensor": "s",
@@ -34,7 +34,11 @@ def estimation(**more: Any) -> Estimation:
         "rotation_gravity_mps2": GRAVITY.tolist(),
         "prior": {"sensitivity": 1.0},
     }
-    return Estimation(parse_config({"devices": devices, "channels": [channel | more]}, "").channels[0], None)
+    return parse_config({"devices": devices, "channels": [channel | more]}, "").channels[0]
+
+
+def estimation(**more: Any) -> Estimation:
+    return Estimation(channel_of(**more), None)
 
 
 def late(window: Window, lag_s: float) -> Window:

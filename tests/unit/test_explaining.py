@@ -51,7 +51,7 @@ def statuses(harm: Harm, seed: int = 1) -> list[StatusChange]:
             Transformed("reference", "reference", 1.07 * np.eye(3)),
             "another reference sensitivity (reference_", 7.0, "certificate.u_sensitivity_pct to 6.9",
         ),
-        (Shifted("offset"), "another offset (Qx", 0.8, "leans by 4.7 deg does the same: level it, or put the newest"),
+        (Shifted("offset"), "another offset (Qx", 0.8, "leans by 4.7 deg does the same: level it. Otherwise: no"),
     ],
 )  # fmt: skip
 def test_the_status_says_what_explains_the_held_windows_best(harm: Harm, best: str, size: float, remedy: str) -> None:

@@ -83,6 +83,20 @@ def test_what_is_no_number_is_not_proposed() -> None:
     assert valid().judge(consistent(), scaled(1.06)).propose
 
 
+@pytest.mark.parametrize(
+    ("places", "reason"),
+    [
+        (np.diag([0.001, 1.0, 1.0]), "output x is dead"),
+        (np.eye(3)[[1, 0, 2]], "det S is negative"),
+        (np.eye(3)[[1, 2, 0]], "axes are exchanged"),
+    ],
+)
+def test_a_dead_output_and_exchanged_axes_are_not_proposed(places: np.ndarray, reason: str) -> None:
+    decision = valid().judge(consistent(), calibration(places @ NOMINAL))
+    assert (decision.action, decision.propose) == ("hold", False)
+    assert reason in decision.reason
+
+
 def _without(*parameters: int) -> Calibration:
     """A calibration whose data determine all but these parameters."""
     found = calibration()

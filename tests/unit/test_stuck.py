@@ -73,7 +73,7 @@ def test_a_stuck_output_is_told_and_never_calibrated(
     used = [report.stop_s for report in reports(results) if report.used]
     assert len(used) == since_s // STAND_S
     assert all(stop_s <= since_s for stop_s in used)
-    assert not any("put the newest estimate in force" in r.reason for r in results if isinstance(r, StatusChange))
+    assert not any("fieldcal command accept" in r.reason for r in results if isinstance(r, StatusChange))
 
 
 def test_all_outputs_are_told() -> None:
