@@ -19,6 +19,7 @@ from calib.model import Array
 from calib.signal.order_statistics import median
 
 CLEAR_SD = 10.0  # robust SDs that a knock reaches: what a filter makes of less is hardly seen
+FLANK_SD = 2.0  # where a knock begins and ends: noise alone is beyond in one sample of eight
 BRIDGED_S = 0.02  # a shorter pause does not end a knock: half a period of a part that rings at 25 Hz
 LONGEST_S = 0.5  # a mount that slips stays where it is, and a continuous rattle goes on
 NEARBY_S = 0.25  # before a sample and after it; a mount rings as long after a blow
@@ -32,9 +33,9 @@ def knocks(columns: Array, inside: Mask, rate_hz: float) -> tuple[Mask, Array]:
 
     `columns` (n, 3 + p) are V, and of the reference all that V is regressed on; rows with NaN are missing samples.
     `inside` (n,) are the samples of the stretch that the regression uses; those beyond may be of another position. A
-    knock is a run of samples beyond five robust SDs that reaches CLEAR_SD of them, times the power of the motion
-    nearby over its usual one: the residual of a response that is not taken out grows with the motion. None are found
-    where more samples would be knocks than a window may have, or where the motion makes them.
+    knock is a run of samples beyond five robust SDs, with its flanks, that reaches CLEAR_SD of them, times the power of
+    the motion nearby over its usual one: the residual of a response that is not taken out grows with the motion. None
+    are found where more samples would be knocks than a window may have, or where the motion makes them.
     """
     none, whole = np.zeros(len(columns), dtype=bool), np.asarray(np.isfinite(columns).all(axis=1))
     own = whole & inside
@@ -45,14 +46,11 @@ def knocks(columns: Array, inside: Mask, rate_hz: float) -> tuple[Mask, Array]:
     clear = away / _times_usual(motion, own, rate_hz) > CLEAR_SD
     struck = none.copy()
     bridged = max(round(BRIDGED_S * rate_hz), 1)
-    for a, b in _runs(away > KNOCK_SD, bridged):
+    for a, b in _runs(away, bridged):
         struck[a:b] = whole[a:b] & (b - a <= LONGEST_S * rate_hz) & clear[a:b].any()
     first, stop = np.flatnonzero(own)[[0, -1]] + [0, 1]
-    for part, most_pct in (
-        (slice(first), BESIDE_PCT),
-        (slice(first, stop), INSIDE_PCT),
-        (slice(stop, None), BESIDE_PCT),
-    ):
+    parts = (slice(first), BESIDE_PCT), (slice(first, stop), INSIDE_PCT), (slice(stop, None), BESIDE_PCT)
+    for part, most_pct in parts:
         if 100.0 * struck[part].sum() > most_pct * whole[part].sum():
             struck[part] = False
     begin = np.flatnonzero(np.diff(struck & own, prepend=False) & struck & own)
@@ -102,10 +100,14 @@ def _tied(motion: Array, own: Mask, at: NDArray[np.intp]) -> bool:
     return bool(len(at)) and statistic > chi2_quantile(1.0 - TIED_BY_CHANCE / len(sizes), 2.0 * len(at))
 
 
-def _runs(on: Mask, longest_pause: int) -> list[tuple[int, int]]:
-    """[first, stop) of each run of flags; pauses of so many samples do not end a run."""
-    at = np.flatnonzero(on)
+def _runs(away: Array, longest_pause: int) -> list[tuple[int, int]]:
+    """[first, stop) of each run of samples beyond KNOCK_SD robust SDs, with its flanks; `away` (n,) is in these SDs.
+    Pauses of so many samples do not end a run."""
+    at = np.flatnonzero(away > KNOCK_SD)
     if not len(at):
         return []
     cuts = np.flatnonzero(np.diff(at) > longest_pause + 1)
-    return list(zip(at[np.append(0, cuts + 1)].tolist(), (at[np.append(cuts, len(at) - 1)] + 1).tolist(), strict=True))
+    calm = np.concatenate([[-1], np.flatnonzero(away <= FLANK_SD), [len(away)]])
+    first = calm[np.searchsorted(calm, at[np.append(0, cuts + 1)]) - 1] + 1
+    stop = calm[np.searchsorted(calm, at[np.append(cuts, len(at) - 1)])]
+    return list(zip(first.tolist(), stop.tolist(), strict=True))
