@@ -42,7 +42,7 @@ def knocks(columns: Array, inside: Mask, rate_hz: float) -> tuple[Mask, Array]:
     if np.count_nonzero(own) <= 2 * columns.shape[1] or (beyond := _beyond(columns, whole, own)) is None:
         return none, np.zeros((len(columns), 3))
     residual, away = beyond
-    motion = np.where(whole[:, None], columns[:, 3:], 0.0) - columns[own, 3:].mean(axis=0)
+    motion = _scaled(np.where(whole[:, None], columns[:, 3:], 0.0) - columns[own, 3:].mean(axis=0), own)
     clear = away / _times_usual(motion, own, rate_hz) > CLEAR_SD
     struck = none.copy()
     bridged = max(round(BRIDGED_S * rate_hz), 1)
@@ -74,10 +74,16 @@ def _beyond(columns: Array, whole: Mask, own: Mask) -> tuple[Array, Array] | Non
     return residual, np.asarray((np.abs(residual) / sd).max(axis=1))
 
 
+def _scaled(motion: Array, own: Mask) -> Array:
+    """The motion (n, p) in units of the rms of each column."""
+    tiny = np.finfo(float).tiny
+    motion = motion / np.maximum(np.abs(motion[own]).max(axis=0), tiny)  # first, so that no square overflows
+    return np.asarray(motion / np.maximum(np.sqrt(np.mean(motion[own] ** 2, axis=0)), tiny))
+
+
 def _times_usual(motion: Array, own: Mask, rate_hz: float) -> Array:
     """(n,) the largest power of the motion (n, p) nearby over the median of that; 1 where it is less than usual."""
-    unit = np.mean(motion[own] ** 2, axis=0)
-    power = np.sum(np.divide(motion**2, unit, out=np.zeros_like(motion), where=unit > 0.0), axis=1)
+    power = np.sum(motion**2, axis=1)
     size = max(round(NEARBY_S * rate_hz), 1)
     blocks = np.maximum.reduceat(power, np.arange(0, len(power), size))
     padded = np.concatenate([blocks[:1], blocks, blocks[-1:]])
@@ -93,8 +99,7 @@ def _tied(motion: Array, own: Mask, at: NDArray[np.intp]) -> bool:
     The share p of the samples with more motion is uniform between 0 and 1 at a random time, so that - 2 sum ln p of
     independent times is chi-squared with two degrees of freedom for each (Fisher 1932).
     """
-    scaled = motion / np.maximum(motion[own].std(axis=0), np.finfo(float).tiny)
-    sizes = [*np.abs(scaled).T, *(np.linalg.norm(part, axis=1) for part in np.split(scaled, 2, axis=1))]
+    sizes = [*np.abs(motion).T, *(np.linalg.norm(part, axis=1) for part in np.split(motion, 2, axis=1))]
     more = [1.0 - (np.searchsorted(np.sort(size[own]), size[at]) - 0.5) / np.count_nonzero(own) for size in sizes]
     statistic = max(-2.0 * float(np.log(p).sum()) for p in more)
     return bool(len(at)) and statistic > chi2_quantile(1.0 - TIED_BY_CHANCE / len(sizes), 2.0 * len(at))
