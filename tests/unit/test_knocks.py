@@ -102,7 +102,7 @@ def test_a_filter_spreads_no_knock_and_the_samples_of_the_sensor_stay_what_they_
     np.testing.assert_array_equal(struck, before)
     assert clean.points.struck is None
     assert found.points.struck is not None
-    hit = np.abs(hits).max(axis=1) > 0.1
+    hit = np.abs(hits).max(axis=1) > 5.0 * NOISE
     at = np.round(found.points.time_s * RATE_HZ).astype(int)
     assert found.points.struck[hit[at]].all()
     assert found.points.struck.sum() < 2 * hit[at].sum()
