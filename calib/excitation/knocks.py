@@ -23,6 +23,7 @@ FLANK_SD = 2.0  # where a knock begins and ends: noise alone is beyond in one sa
 BRIDGED_S = 0.02  # a shorter pause does not end a knock: half a period of a part that rings at 25 Hz
 LONGEST_S = 0.5  # a mount that slips stays where it is, and a continuous rattle goes on
 NEARBY_S = 0.25  # before a sample and after it; a mount rings as long after a blow
+MOST_OF_THEM = 0.5  # of the samples beyond KNOCK_SD are in knocks; what rattles is beyond it by any amount
 INSIDE_PCT = DEFAULT_LIMITS.most_left_out_pct
 BESIDE_PCT = DEFAULT_LIMITS.most_left_out_of_segment_pct  # before and after the stretch, the sensor may be turned
 TIED_BY_CHANCE = 0.02  # of windows with knocks at random times: theirs seem to be where the motion is strong
@@ -35,7 +36,8 @@ def knocks(columns: Array, inside: Mask, rate_hz: float) -> tuple[Mask, Array]:
     `inside` (n,) are the samples of the stretch that the regression uses; those beyond may be of another position. A
     knock is a run of samples beyond five robust SDs, with its flanks, that reaches CLEAR_SD of them, times the power of
     the motion nearby over its usual one: the residual of a response that is not taken out grows with the motion. None
-    are found where more samples would be knocks than a window may have, or where the motion makes them.
+    are found where more samples would be knocks than a window may have, where most samples beyond five SDs are in none,
+    or where the motion makes them.
     """
     none, whole = np.zeros(len(columns), dtype=bool), np.asarray(np.isfinite(columns).all(axis=1))
     own = whole & inside
@@ -53,6 +55,9 @@ def knocks(columns: Array, inside: Mask, rate_hz: float) -> tuple[Mask, Array]:
     for part, most_pct in parts:
         if 100.0 * struck[part].sum() > most_pct * whole[part].sum():
             struck[part] = False
+    beyond_own = own & (away > KNOCK_SD)
+    if np.count_nonzero(struck & beyond_own) < MOST_OF_THEM * np.count_nonzero(beyond_own):
+        return none, residual
     begin = np.flatnonzero(np.diff(struck & own, prepend=False) & struck & own)
     before = np.maximum(begin - bridged, 0)  # the knock itself may move the reference a little
     return (none, residual) if _tied(motion, own, before[own[before]]) else (struck, residual)

@@ -161,6 +161,14 @@ def test_a_mount_that_rings_where_the_motion_is_strong_is_no_knock() -> None:
     assert made.flagged(made.V + made.ring(elsewhere_s, 2.0, 0.005)).any()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_residual_with_all_sizes_is_not_made_of_knocks(seed: int) -> None:
+    """As a loose part that rings longer than from hit to hit, at a low rate: its strongest hits alone are no knocks."""
+    made = Made(seed)
+    V = made.V + 0.05 * made.random.standard_t(1.5, size=made.V.shape)
+    assert not made.flagged(V).any()
+
+
 @pytest.mark.parametrize("begin_s", [30.0, SPAN_S[1] - 1.5])
 def test_a_slip_is_no_knock_and_a_knock_before_it_hides_none(begin_s: float) -> None:
     made = Made(6)
