@@ -100,9 +100,12 @@ def one(job: Job) -> Result:
     own = [make[name](corner_hz * by) for by in times.tolist()]
     by_axis: Filter = lambda f: np.stack([h(f) for h in own])  # noqa: E731
     undone: Filter = lambda f: 1.0 / by_axis(f)  # noqa: E731
+    # Motion that reaches beyond a filter of the reference is lost to it; motion that does not may be what it shows.
+    lost = in_reference and bool(skirts)
     made = pair(
-        seed, undone if in_reference else flat, of_outputs=flat if in_reference else by_axis, band_hz=band_hz,
-        rate_hz=10.0 * band_hz[1], seconds=300.0, reference_error=float(error), skirts=skirts,
+        seed, undone if in_reference and not lost else flat, of_outputs=flat if in_reference else by_axis,
+        of_reference=by_axis if lost else flat, band_hz=band_hz, rate_hz=10.0 * band_hz[1], seconds=300.0,
+        reference_error=float(error), skirts=skirts,
     )  # fmt: skip
     stated = Priors(
         reference=U_REFERENCE,

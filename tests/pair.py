@@ -138,6 +138,7 @@ def pair(
     response: Filter,
     *,
     of_outputs: Filter = flat,
+    of_reference: Filter = flat,
     band_hz: tuple[float, float] = (0.5, 10.0),
     rate_hz: float = 100.0,
     seconds: float = 120.0,
@@ -153,8 +154,8 @@ def pair(
 ) -> Pair:
     """Random motion in `band_hz`, the same power at all its frequencies; `reference_error` is relative.
 
-    The sensor's input axes show the motion through `response` and its outputs through `of_outputs`, both alike in all
-    axes (F,) or by axis (3, F).
+    The sensor's input axes show the motion through `response`, its outputs through `of_outputs`, and the reference
+    through `of_reference`, each alike in all axes (F,) or by axis (3, F).
     `known`: what is stated of the filters, whatever they are. `disturbed`: what is added to both signals. The samples
     of the reference are taken `reference_late_s` after those of the sensor. `stated_noise_mps2`: what is stated of its
     noise. `skirts`: the order of the Butterworth filters at both ends of `band_hz` that shape the motion; 0 lets it end
@@ -170,10 +171,13 @@ def pair(
     lines = (random.normal(size=(3, len(moved))) + 1j * random.normal(size=(3, len(moved)))) * moved
     lines *= level_mps2 / np.fft.irfft(lines, n).std()
     middle_hz = float(np.sqrt(band_hz[0] * band_hz[1]))
-    at_middle, outputs_at_middle = (np.abs(own(np.array([middle_hz]))) for own in (response, of_outputs))
+    at_middle, outputs_at_middle, reference_at_middle = (
+        np.abs(own(np.array([middle_hz]))) for own in (response, of_outputs, of_reference)
+    )
     sensitivity = np.eye(3) + 0.02 * random.normal(size=(3, 3))
     inside = slice(int(BEYOND_S * rate_hz), int((BEYOND_S + seconds) * rate_hz))
-    u = np.fft.irfft(lines * np.exp(2j * np.pi * frequency_hz * reference_late_s), n).T[inside]
+    shown = lines * of_reference(frequency_hz) / reference_at_middle
+    u = np.fft.irfft(shown * np.exp(2j * np.pi * frequency_hz * reference_late_s), n).T[inside]
     felt = sensitivity @ (lines * response(frequency_hz) / at_middle)
     V = np.fft.irfft(felt * of_outputs(frequency_hz) / outputs_at_middle, n).T[inside] + OFFSET
     V += noise_mps2 * random.normal(size=V.shape)

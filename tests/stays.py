@@ -86,6 +86,21 @@ def stays(
     return Stays(time_s, indications, reference_time_s, velocity, poses)
 
 
+def knocked(rate_hz: float, duration_s: float = 0.02, peak_mps2: float = 8.0) -> Struck:
+    """Knocks of the sensor alone: half-sines at random times in random directions, each of 0.3 to 1 of the peak."""
+
+    def struck(random: np.random.Generator, time_s: Array) -> Array:
+        felt = np.zeros((len(time_s), 3))
+        for at_s in random.uniform(time_s[0], time_s[-1], random.poisson(rate_hz * (time_s[-1] - time_s[0]))):
+            direction, size = random.normal(size=3), peak_mps2 * random.uniform(0.3, 1.0)
+            during = (time_s >= at_s) & (time_s < at_s + duration_s)
+            shape = np.sin(np.pi * (time_s[during] - at_s) / duration_s)
+            felt[during] += np.outer(size * shape, direction / np.linalg.norm(direction))
+        return felt @ S_TRUE.T
+
+    return struck
+
+
 def in_batches(time_s: Array, size: int, late_s: Array | float = 0.0) -> Array:
     """The stamps (n,) of samples that arrive in batches of `size`, each `late_s` (batches,) after its newest sample."""
     batch = np.arange(len(time_s)) // size

@@ -21,10 +21,11 @@ from agent.core.windows import margin_of
 from agent.recording.reading import RecordingReader
 from agent.recording.records import Fault
 from agent.report.trace import Trace
-from calib.excitation.front_end import aligned, most_margin_s
+from calib.excitation.front_end import Settings, aligned, most_margin_s
 from calib.model import Pose
 from hw.block import SampleBlock
 
+SHOWN = Settings(leave_out=False)  # knocks are shown
 MOST_TRACES = 24  # windows kept point by point: the newest window of each of so many positions
 
 
@@ -173,7 +174,7 @@ class _Windows:
         reference = self._streams[channel.reference].cut(start_s - around_s, stop_s + around_s)
         lag_s = window.numbers.get("lag_applied_s", 0.0)
         instrument, span_s = channel.instrument, (start_s, stop_s)
-        found = None if reference is None else aligned(cut, reference, instrument, span_s, lag_s)
+        found = None if reference is None else aligned(cut, reference, instrument, span_s, lag_s, SHOWN)
         if found is None:
             return None
         points = found.points

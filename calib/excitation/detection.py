@@ -77,7 +77,7 @@ def _beyond(columns: Array, outputs: Array, finest: Array, growth: Array) -> tup
     steady = bool(growth.max() <= 1.0)
     for _ in range(KNOCK_PASSES):
         kept = np.flatnonzero(~struck) if struck.any() else slice(None)
-        residual = outputs - _regression(columns[:, kept], outputs[:, kept]) @ columns
+        residual = outputs - regression(columns[:, kept], outputs[:, kept]) @ columns
         away = np.abs(residual) if steady else np.abs(residual) / growth
         if not struck.any() and _is_calm(away):
             break
@@ -115,7 +115,7 @@ def _growth(motion: Array, residual: Array) -> Array:
     return growth
 
 
-def _regression(columns: Array, outputs: Array) -> Array:
+def regression(columns: Array, outputs: Array) -> Array:
     """(3, p) least squares of outputs (3, n) on columns (p, n).
 
     By normal equations, or by a factorisation if the columns are almost dependent (see INDEPENDENT).

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib.excitation.bands import parts
 from calib.excitation.detection import RELATED, incoherent_by_band
-from calib.excitation.turning import feels_gravity, standing_parts
+from calib.excitation.turning import is_turned
 from calib.excitation.windows import Points
 from calib.model import Array, BandSums
 from calib.signal.band import convolved, hanning
@@ -80,7 +80,7 @@ def against_noise(points: Points, reference_noise: Array, *, knocked: bool) -> N
     u, rate_hz = points.u[:, :channels], float((len(points.u) - 1) / (points.time_s[-1] - points.time_s[0]))
     size = 2 * (len(u) // (SEGMENTS + 1))
     edges = _edges(size // 2)
-    if len(edges) < 3 or _is_turned(u, rate_hz):
+    if len(edges) < 3 or is_turned(u, rate_hz):  # a filter would spread each turn
         return None
     motion, noise, alone = _powers(np.hstack([points.V, u]), size, edges)
     lines = np.diff(edges).astype(np.float64)
@@ -118,13 +118,6 @@ def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float) -
     most = np.sum(moved * alone, axis=0) / np.maximum(moved.sum(axis=0), TINY) * bands
     size = np.sqrt(np.divide(0.5 * most, power, out=np.ones_like(power), where=power > CLEARLY * most))
     return np.asarray(noise * size)
-
-
-def _is_turned(u: Array, rate_hz: float) -> bool:
-    """Whether a reference u (n, m) that feels gravity is turned: a filter would spread each turn."""
-    if u.shape[1] != 3 or not feels_gravity(u):
-        return False
-    return standing_parts(u, rate_hz) != [(0, len(u))]
 
 
 def _edges(lines: int) -> NDArray[np.int64]:

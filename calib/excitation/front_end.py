@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +19,9 @@ from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_t
 from calib.excitation.bands import TAPER, beside_noise
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
 from calib.excitation.hum import hum_hz, without_lines
+from calib.excitation.knocks import knocks
 from calib.excitation.sustained import sustained_hz
-from calib.excitation.turning import feels_gravity, standing_parts
+from calib.excitation.turning import feels_gravity, is_turned, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, disproportionate
 from calib.excitation.windows import CALM, Points, at_rest, motion_windows, rest_window, still_window
 from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
@@ -169,24 +171,21 @@ def aligned(
     if len(time_s) < 2:
         return None
     sensor_rate_hz = float((len(time_s) - 1) / (time_s[-1] - time_s[0]))
-    raw, V, raw_filled, filled = without_short_holes(raw, sensor.values, (rate_hz, sensor_rate_hz))
-    u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
-    m, inside = u.shape[1], _within(time_s, span_s)
-    if instrument.has_corner:
-        u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
-        V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
-    u = passed(instrument.known.passed(u, rate_hz), rate_hz, response)
-    at = resample(u, reference.clock, time_s - lag_s, reference.first_index, lost)
-    k, rows = u.shape[1], np.empty((3 + 2 * u.shape[1], len(V)))  # here and in what is kept: a channel is a row
-    rows[:3], rows[3 : 3 + k], rows[3 + k :] = V.T, at.u.T, at.du.T
-    rows[:, ~at.usable] = np.nan
-    columns = rows.T
-    shown = np.isfinite(columns).all(axis=1) & inside
+    m, inside, struck = raw.shape[1], _within(time_s, span_s), np.zeros(len(time_s), dtype=bool)
+    beside = partial(_side_by_side, raw, sensor, reference, instrument, sensor_rate_hz, lag_s, response)
+    as_measured = made = beside(sensor.values)
+    shown = np.isfinite(made.columns).all(axis=1) & inside
+    if settings.leave_out and settings.limit_band and not is_turned(made.columns[shown, 3 : 3 + m], sensor_rate_hz):
+        struck, residual = knocks(made.columns, inside, sensor_rate_hz)
+        if struck.any():
+            made = beside(sensor.values - np.where(struck[:, None], residual, 0.0))
+            shown = np.isfinite(made.columns).all(axis=1) & inside
+    columns, raw, u, V, raw_filled, filled = made
     hums_hz = hum_hz(columns[shown, 3 : 3 + m], columns[shown, :3], sensor_rate_hz) if settings.limit_band else []
     if hums_hz:
         columns = without_lines(columns, sensor_rate_hz, hums_hz)
-    band_hz, noise = band_to_keep(raw, at.u[at.usable][:, :m], V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
-    clipped, independent, unfiltered = 0, 1.0, columns
+    band_hz, noise = band_to_keep(raw, u, V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
+    clipped, independent, unfiltered = 0, 1.0, as_measured.columns if struck.any() else columns
     if band_hz is not None and settings.limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
         columns = lowpass(columns, sensor_rate_hz, band_hz)
@@ -212,12 +211,51 @@ def aligned(
         "hum_lines": len(hums_hz),
     }
     kept = as_slice(np.flatnonzero(usable))
-    points = Points(time_s[kept], *np.split(columns.T[:, kept].T, [3, 3 + k], axis=1))
+    V_kept, u_kept, du_kept = np.split(columns.T[:, kept].T, [3, (3 + columns.shape[1]) // 2], axis=1)
+    points = Points(time_s[kept], V_kept, u_kept, du_kept, struck[kept] if struck.any() else None)
     noise = noise if against is None else against.reference_noise
     noise = not_more_than_incoherent(noise, points.u[:, :m], points.V, sensor_rate_hz)
     told = {name: float(count) for name, count in counts.items() if count}
     sensor_noise = np.sqrt(0.5 * sensor_rate_hz) * band_above_noise(V, sensor_rate_hz)[1]
     return Aligned(points, noise, sensor_noise, clipped, independent, band_hz if settings.limit_band else None, told)
+
+
+class _Beside(NamedTuple):
+    """Sensor and reference side by side: `columns` (n, 3 + 2 k) are V, u and du at the sensor's times, NaN where one is
+    missing; `raw` (r, m) and `V` (n, 3) before, their short holes filled, and which of them were; `u` (q, m) where
+    the reference is known."""
+
+    columns: Array
+    raw: Array
+    u: Array
+    V: Array
+    raw_filled: Mask
+    filled: Mask
+
+
+def _side_by_side(
+    raw: Array,
+    sensor: Samples,
+    reference: Samples,
+    instrument: Instrument,
+    sensor_rate_hz: float,
+    lag_s: float,
+    response: Response,
+    indications: Array,
+) -> _Beside:
+    """`raw` (r, m) are the reference's samples, `indications` (n, 3) the sensor's; NaN where they are missing."""
+    rate_hz, m = reference.clock.rate_hz, raw.shape[1]
+    raw, V, raw_filled, filled = without_short_holes(raw, indications, (rate_hz, sensor_rate_hz))
+    u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
+    if instrument.has_corner:
+        u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
+        V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
+    u = passed(instrument.known.passed(u, rate_hz), rate_hz, response)
+    at = resample(u, reference.clock, sensor.time_s - lag_s, reference.first_index, lost)
+    k, rows = u.shape[1], np.empty((3 + 2 * u.shape[1], len(V)))  # here and in what is kept: a channel is a row
+    rows[:3], rows[3 : 3 + k], rows[3 + k :] = V.T, at.u.T, at.du.T
+    rows[:, ~at.usable] = np.nan
+    return _Beside(rows.T, raw, at.u[at.usable][:, :m], V, raw_filled, filled)
 
 
 def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:

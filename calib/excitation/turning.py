@@ -16,6 +16,11 @@ def feels_gravity(u: Array) -> bool:
     return len(u) > 0 and float(np.linalg.norm(u, axis=1).mean()) > LEAST_GRAVITY_MPS2
 
 
+def is_turned(u: Array, rate_hz: float) -> bool:
+    """Whether a reference u (n, m) in m/s2 feels gravity and is turned."""
+    return u.shape[1] == 3 and feels_gravity(u) and standing_parts(u, rate_hz) != [(0, len(u))]
+
+
 def standing_parts(u: Array, rate_hz: float) -> list[tuple[int, int]]:
     """[first, stop) of the samples u (n, 3), in m/s2, between which nothing was turned, GUARD_S off each turn.
 

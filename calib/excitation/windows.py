@@ -37,17 +37,25 @@ Kind = Literal["motion", "rest", "quiet"]
 class Points(NamedTuple):
     """Samples of the sensor with the reference at the same times.
 
-    `time_s` (n,) rises; `V` (n, 3) in output unit; `u` (n, m) in m/s2 and its derivative `du` (n, m) in m/s3.
+    `time_s` (n,) rises; `V` (n, 3) in output unit; `u` (n, m) in m/s2 and its derivative `du` (n, m) in m/s3. `struck`
+    (n,) flags samples that are known to be knocks: in V is what the motion explains in their places. None where none
+    are known.
     """
 
     time_s: Array
     V: Array
     u: Array
     du: Array
+    struck: NDArray[np.bool_] | None = None
+
+    def at(self, which: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Points:
+        """Some of the samples."""
+        struck = None if self.struck is None else self.struck[which]
+        return Points(self.time_s[which], self.V[which], self.u[which], self.du[which], struck)
 
     def part(self, first: int, stop: int) -> Points:
         """The samples [first, stop)."""
-        return Points(*(column[first:stop] for column in self))
+        return self.at(slice(first, stop))
 
     def within(self, start_s: float, stop_s: float) -> Points:
         """The samples from one time to another, both included."""
@@ -161,12 +169,13 @@ def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *,
     """
     rests = find_rests(points.V, _rate(points.time_s))
     if not rests:
-        sums = _sums(*points[1:], _rate(points.time_s), limits)
+        sums = _sums(points.V, points.u, points.du, _rate(points.time_s), limits)
         numbers = {"points": float(len(points.V)), "left_out_pct": 0.0}
         return _window("rest", pose, points.time_s, sums, _never(numbers), 0)
     resting = np.concatenate([np.arange(a, b) for a, b in rests])
-    t, V, u, du = (column[resting] for column in points)
+    t, V, u, du, known = points.at(resting)
     struck, _ = detection.knocked(np.asfortranarray(V), np.ones((len(V), 1)), detection.least_step(V))
+    struck = struck if known is None else struck | known
     kept = ~struck if leave_out else np.ones(len(V), dtype=bool)
     sums = _sums(V[kept], u[kept], du[kept], _rate(points.time_s), limits)
     m = sums.reference_channels
@@ -219,7 +228,7 @@ def _motion(
     Where knocks lie together, whole segments are left out; the limits are held against the other segments. But after a
     slip the shorter part of a window looks like knocks: `stepped` is the step of the mean over all segments.
     """
-    t, _, u, du = points
+    t, _, u, du, known = points
     V = np.asfortranarray(points.V)  # medians and extremes of an axis are several times faster this way
     if len(V) < max(limits.least_points, 2 * u.shape[1] + 2):
         sums = _sums(V, u, du, rate_hz, limits)
@@ -227,11 +236,11 @@ def _motion(
     basis = np.vstack([np.ones(len(u)), u.T, du.T]).T
     finest = detection.least_step(V)
     struck, residual = detection.knocked(V, basis, finest)
+    struck = struck if known is None else struck | known
     stepped = stepped or step(residual, rate_hz)
     sound = _sound(struck, rate_hz, limits)
     if leave_out and not sound.all():
-        left = Points(*(column[sound] for column in points))
-        rest = _motion(kind, pose, left, rate_hz, limits, leave_out, 0.0, stepped)
+        rest = _motion(kind, pose, points.at(sound), rate_hz, limits, leave_out, 0.0, stepped)
         bands = _bands(points, struck | ~sound, residual, rate_hz, taper) if taper and rest.used else None
         return _without_segments(replace(rest, bands=bands), int((~sound).sum()))
     clean = sums = _sums(V, u, du, rate_hz, limits)

@@ -204,10 +204,10 @@ class Tables:
 
     def runs(self) -> Iterator[tuple[Points, Window]]:
         """Windows with motion and all their samples, not filtered, for methods that need more than sums."""
-        settings = self._making.settings
+        settings = replace(self._making.settings, limit_band=False)
         for interval in self.poses:
             for piece in self._pieces(interval):
-                found = self._aligned(interval, *piece, 0.0, limit_band=False)
+                found = self._aligned(interval, *piece, 0.0, settings)
                 if found is None:
                     continue
                 for window in motion_windows(
@@ -222,21 +222,23 @@ class Tables:
 
         Missing samples are interpolated.
         """
+        settings = replace(self._making.settings, limit_band=False)
         for interval in self.poses:
             for piece in self._pieces(interval):
-                found = self._aligned(interval, *piece, 0.0, limit_band=False)
+                found = self._aligned(interval, *piece, 0.0, settings)
                 if found is not None:
-                    t, V, u, _ = found.points
+                    t, V, u, *_ = found.points
                     even_s = np.arange(t[0], t[-1], 1.0 / self.rate_hz)
                     yield _interpolated(even_s, t, V), _interpolated(even_s, t, u)
 
     def points(self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float = 0.0) -> Points | None:
-        """Samples of the sensor from `start_s` to `stop_s`.
+        """Samples of the sensor from `start_s` to `stop_s`, knocks included.
 
         With a reference: those with a reference value, at its times.
         """
         if interval.pose.direction.shape[1]:
-            found = self._aligned(interval, start_s, stop_s, lag_s, limit_band=self._making.settings.limit_band)
+            every = replace(self._making.settings, leave_out=False)
+            found = self._aligned(interval, start_s, stop_s, lag_s, every)
             return None if found is None else found.points
         sensor = self._sensor.cut(start_s, stop_s)
         if sensor is None:
@@ -246,12 +248,11 @@ class Tables:
         return Points(sensor.time_s[whole], sensor.values[whole], nothing, nothing)
 
     def _aligned(
-        self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float, *, limit_band: bool
+        self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float, settings: Settings
     ) -> Aligned | None:
         sensor, reference = self._cut(interval, start_s, stop_s, lag_s)
         if sensor is None or reference is None:
             return None
-        settings = replace(self._making.settings, limit_band=limit_band)
         return aligned(sensor, reference, self._instrument, (start_s, stop_s), lag_s, settings)
 
     def _rest_floor(self) -> Array | None:

@@ -199,7 +199,7 @@ def test_a_sensor_that_lags_still_follows() -> None:
 def test_missing_samples_part_windows() -> None:
     data = points()
     kept = np.r_[0:1500, 1700:4000]
-    windows = motion_windows(POSE, Points(*(column[kept] for column in data)))
+    windows = motion_windows(POSE, data.at(kept))
     assert [w.points for w in windows] == [1500, 2300]
     assert all(w.used for w in windows)
 
@@ -302,7 +302,7 @@ def test_of_whatever_samples_are_left_windows_are_made(seed: int, share: float, 
     kept = np.flatnonzero(random.random(len(data.V)) < share)
     if len(kept) < 2:
         kept = np.array([0, len(data.V) - 1])
-    left = Points(*(column[kept] for column in data))
+    left = data.at(kept)
     windows = motion_windows(POSE, left, Limits(longest_s=longest_s))
     assert sum(w.points + w.left_out for w in windows) <= len(kept)
     assert all(w.stop_s > w.start_s for w in windows)

@@ -51,7 +51,7 @@ def test_of_a_window_knocked_almost_throughout_too_little_is_left() -> None:
 def test_knocks_spread_all_over_refuse_the_window_at_a_low_rate_too(seed: int) -> None:
     """At 50 Hz a segment has 25 points: of 8 % that are struck here and there, hardly a segment has many."""
     data = points(40.0)
-    slow = Points(*(column[::10] for column in data))
+    slow = data.at(slice(None, None, 10))
     out = np.random.default_rng(seed).random(len(slow.V)) < 0.08
     window = only(motion_windows(POSE, slow._replace(V=slow.V + np.where(out, 5.0, 0.0)[:, None])))
     assert not window.used
