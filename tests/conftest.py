@@ -67,6 +67,17 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     os.nice(getattr(session.config, "workerinput", {"nice": 0})["nice"])
 
 
+@pytest.fixture(autouse=True)
+def _signals_as_before() -> Iterator[None]:
+    """A run that a test makes in this process ends with its signals ignored, and so would every later child: a pool of
+    processes then waits for ever for workers that it tells to end."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        if handler is not None and signal.getsignal(number) is not handler:
+            signal.signal(number, handler)
+
+
 @pytest.fixture
 def site() -> Iterator[Site]:
     """A Zenoh router on this machine, for gateways and consumers."""
