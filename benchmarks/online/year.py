@@ -183,6 +183,8 @@ def _note(year: Year, building: Building, update: CalibrationUpdate) -> None:
     year.syy_error.append(S[1, 1] / true_syy - 1)
     year.u_syy.append(u[SYY])
     held = np.array(update.sensitivity_at_0hz.sensitivity or update.sensitivity)
+    if update.sensitivity_per_k:
+        held = held + np.array(update.sensitivity_per_k) * (truth.temperature_degc - update.reference_temperature_degc)
     year.mean_error_mps2.append(held @ GRAVITY + at_temperature(update, truth.temperature_degc) - truth.mean_output)
     year.offset_error.append(np.array(update.offset) - truth.offset_at_mean)
     year.u_offset.append(u[9:])

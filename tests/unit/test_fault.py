@@ -55,7 +55,7 @@ def break_the_windows(patch: pytest.MonkeyPatch) -> str:
 
 
 def break_the_judge(patch: pytest.MonkeyPatch) -> str:
-    patch.setattr(Estimation, "_try", broken)
+    patch.setattr(Estimation, "_tried_of", broken)
     return "agent/core/estimation.py"
 
 
