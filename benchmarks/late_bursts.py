@@ -30,11 +30,11 @@ LATE_S, LASTS_S, LOST = 0.05, 10.0, 5
 Blocks = Iterable[Event]
 
 
-def late(events: Blocks, times_s: Array) -> Iterator[Event]:
-    """The sensor's arrivals are late for a while from these times on; none overtakes one before."""
+def late(events: Blocks, times_s: Array, device: str = "sensor") -> Iterator[Event]:
+    """A device's arrivals are late for a while from these times on; none overtakes one before."""
     newest_ns = 0
     for event in events:
-        if isinstance(event, SampleBlock) and event.device == "sensor":
+        if isinstance(event, SampleBlock) and event.device == device:
             since_s = event.burst_t_monotonic_ns[:, None] * 1e-9 - times_s
             by_ns = round(LATE_S * 1e9) * ((since_s >= 0.0) & (since_s < LASTS_S)).any(axis=1)
             arrival_ns = np.maximum.accumulate(np.maximum(event.burst_t_monotonic_ns + by_ns, newest_ns))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MOST_MEMORIES = 8  # states of devices that were used under one sensor name, one after the other; 0.1 MB each
+MOST_MEMORIES = 8  # states of devices that were used under one sensor name, one after the other; 2 MB each at most
 
 
 @dataclass(frozen=True, slots=True)

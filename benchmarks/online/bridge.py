@@ -149,7 +149,8 @@ def _axle(forces: Array, time_s: Array, at_s: float, across_s: float, weight: Ar
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Happens(Harm):
-    """What happens to the devices by day. `turn` (3, 3): of the sensor, as gravity and motion see it."""
+    """What happens to the devices by day. After the turn the outputs are `turn` (3, 3) times what they were; S is near
+    1, so that this is a sensor that is turned with its mount."""
 
     turn: Array = field(default_factory=lambda: np.eye(3))
     range_mps2: float = 19.6

@@ -38,7 +38,7 @@ ELSEWHERE = {
     **dict.fromkeys(("table", "known", "skirts", "inside"), "benchmarks.response"), "walks": "benchmarks.walks",
     "faults": "tests.faults.outcome", "soak-day": "benchmarks.soak", "soak-hour": "benchmarks.soak",
     **{name: f"benchmarks.online.{name}" for name in
-       ("agreement", "bench", "chip", "cost", "coverage", "day", "filters", "harm", "lorries",
+       ("agreement", "bench", "bridge", "chip", "cost", "coverage", "day", "filters", "harm", "lorries",
         "references", "temperature", "touched", "year")},
 }  # fmt: skip
 

@@ -5,41 +5,24 @@ Where samples are lost that nobody counts, what is left of the window is used.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from agent.core.events import CalibrationUpdate, Event, Result, StatusChange, WindowReport
-from benchmarks.online.node import RATE_HZ, Node, Stated, Timing, node
-from benchmarks.online.runner import EPOCH_NS, Run, visits
-from hw.block import SampleBlock
+from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from benchmarks.late_bursts import LASTS_S, late, lossy
+from benchmarks.online.node import RATE_HZ, Stated, Timing, node
+from benchmarks.online.runner import Run, visits
 
-WINDOW_S, WINDOWS, LATE_S, LASTS_S = 30.0, 10, 0.05, 10.0
+WINDOW_S, WINDOWS = 30.0, 10
 GUARD_S = 0.5  # at the begin of the first window
 SINCE_S = np.array([131.0, 173.0, 204.0, 245.0])  # at the begin, in the middle and at the end of windows
-
-
-def late(drawn: Node, device: str) -> Iterator[Event]:
-    """The events of the building without a pause; for ten seconds again and again all arrivals of a device are late."""
-    newest_ns = 0
-    for event in visits(drawn.building, range(WINDOWS)):
-        if isinstance(event, SampleBlock) and event.device == device:
-            since_s = event.burst_t_monotonic_ns[:, None] * 1e-9 - SINCE_S
-            by_ns = round(LATE_S * 1e9) * ((since_s >= 0.0) & (since_s < LASTS_S)).any(axis=1)
-            arrival_ns = np.maximum.accumulate(np.maximum(event.burst_t_monotonic_ns + by_ns, newest_ns))
-            newest_ns = int(arrival_ns[-1])
-            yield replace(event, burst_t_monotonic_ns=arrival_ns, t_utc_ns=EPOCH_NS + newest_ns)
-        else:
-            yield event
 
 
 @pytest.mark.parametrize("device", ["sensor", "reference"])
 def test_every_window_is_used_right_and_tells_how_many_samples_were_late(device: str) -> None:
     drawn = node(3, all_axes=True, stated=Stated(lag_s=0.02), timing=Timing(WINDOW_S, 0.0, WINDOWS))
     run, results = Run(drawn.config), list[Result]()
-    for event in late(drawn, device):
+    for event in late(visits(drawn.building, range(WINDOWS)), SINCE_S, device):
         results += run.feed(event)
     windows = [r for r in results if isinstance(r, WindowReport)]
     assert [w.used for w in windows] == [True] * len(windows)
@@ -57,26 +40,10 @@ def test_every_window_is_used_right_and_tells_how_many_samples_were_late(device:
     assert np.max(np.abs(error) / update.standard_uncertainty) < 3.5  # 12 errors: beyond in one of 180 runs
 
 
-def lossy(drawn: Node, at_s: Sequence[float], samples: int) -> Iterator[Event]:
-    """The events of the building; each time so many samples of the sensor are lost, which its count does not show."""
-    due, lost = list(at_s), 0
-    for event in visits(drawn.building, range(WINDOWS)):
-        if isinstance(event, SampleBlock) and event.device == "sensor":
-            shown, count, before = event.indications, event.burst_count.copy(), lost
-            while due and event.burst_t_monotonic_ns[-1] * 1e-9 > due[0]:
-                burst = int(np.searchsorted(event.burst_t_monotonic_ns * 1e-9, due.pop(0)))
-                shown = np.delete(shown, slice(count[burst] - samples, count[burst]), axis=0)
-                count[burst:] -= samples
-                lost += samples
-            yield replace(event, first_index=event.first_index - before, indications=shown, burst_count=count)
-        else:
-            yield event
-
-
 def test_of_a_window_in_which_samples_are_lost_uncounted_the_longest_part_is_used() -> None:
     drawn = node(3, all_axes=True, stated=Stated(lag_s=0.02), timing=Timing(WINDOW_S, 0.0, WINDOWS))
     run, results = Run(drawn.config), list[Result]()
-    for event in lossy(drawn, (160.0, 222.0), 5):
+    for event in lossy(visits(drawn.building, range(WINDOWS)), np.array([160.0, 222.0])):
         results += run.feed(event)
     windows = [r for r in results if isinstance(r, WindowReport)]
     assert [w.used for w in windows] == [True] * len(windows)

@@ -33,6 +33,11 @@ def test_zeros_take_little_room() -> None:
     assert len(pack({"a": np.ones(1000)})) < 8060
 
 
+def test_samples_of_a_dead_device_do_not_make_a_snapshot_unreadable() -> None:
+    samples = np.zeros((6_000_000, 3))
+    assert unpack(pack({"sensor": samples}))["sensor"].shape == samples.shape
+
+
 def _forged(shape: list[int], data: bytes, code: int = 2) -> bytes:
     head = msgspec.msgpack.encode(["<f8", shape])
     array = msgspec.msgpack.Ext(code, bytes([len(head)]) + head + data)
