@@ -230,11 +230,15 @@ def _shared_in(pose: Pose, live: NDArray[np.bool_], along: Array, ahead: Array) 
     return replace(pose, along=moving, along_rate_s=rate)
 
 
-def _power(window: Window) -> Array:
-    """(2 m, 2 m) covariance of u and du/dt of a reference's own channels."""
-    m, channels = own_channels(window.sums.reference_channels), window.sums.reference_channels
-    columns = np.r_[0:m, channels : channels + m]
-    return np.asarray(window.sums.scatter.sum(axis=0)[np.ix_(columns, columns)] / window.sums.count.sum())
+def _power(window: Window, between: bool = False) -> Array:
+    """(2 m, 2 m) covariance of u and du/dt of a reference's own channels within segments; with that `between` them."""
+    sums, m = window.sums, own_channels(window.sums.reference_channels)
+    columns = np.r_[0:m, sums.reference_channels : sums.reference_channels + m]
+    products, count = sums.scatter[:, columns[:, None], columns].sum(axis=0), sums.count.sum()
+    if between:
+        away = sums.mean[:, columns] - sums.count @ sums.mean[:, columns] / count
+        products = products + (sums.count[:, None] * away).T @ away
+    return np.asarray(products / count)
 
 
 def _own_power(power: Array, noise: Array, most: int) -> Array:
@@ -268,7 +272,7 @@ def _shared(window: Window, live: NDArray[np.bool_], noise: Array) -> tuple[Arra
     """The shared motion of the silent channels (rows): (m, m) on u of the live channels (columns), and (m, m) in s on
     their du/dt. The elements of other rows and columns are 0. `noise` (2, m) is the power of the reference's noise.
     """
-    m, power = len(live), _power(window)
+    m, power = len(live), _power(window, between=True)
     found = np.zeros((m, 2 * m))
     if live.any() and not live.all():
         moving = np.flatnonzero(np.tile(live, 2))

@@ -25,6 +25,14 @@ def test_slow_turning(axes: int) -> None:
     assert counts.coverage > 0.95
 
 
+def test_a_channel_that_hardly_moves() -> None:
+    """Two axes, the third shows 2 % of the motion, most of it slower than a segment; before, S_xx was 5.1 u off."""
+    counts = Counts()
+    one(96, 2, counts)
+    assert (counts.valid, counts.wrong) == (1, [])
+    assert counts.worst_u < 3.0
+
+
 def test_what_is_not_finite_is_refused_and_so_is_a_u_above_the_main_sensitivity() -> None:
     grounds = adjust(clamp_points(np.random.default_rng(1)).windows, Priors()).grounds
     assert grounds.reasons == ()
