@@ -1,6 +1,6 @@
 """Motion in a plane or along a line that is not along the axes: is a determined element ever wrong, and is U right?
 
-    python -m benchmarks.planar [--seeds 300] [--online]
+    python -m benchmarks.planar [MOTION ...] [--seeds 300] [--online]
 
 Planes, S and the errors of all that is stated are drawn (tests/planar_world.py). `--online`: the windows of ten
 recordings of one plane go through the estimator of the agent, one after the other.
@@ -106,12 +106,16 @@ def _visits(world: World, S: np.ndarray, plane: np.ndarray, seed: int) -> Iterat
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("motions", nargs="*", metavar="MOTION", help=f"{'; '.join(WORLDS)} (all)")
     parser.add_argument("--seeds", type=int, default=300)
     parser.add_argument("--online", action="store_true")
     options = parser.parse_args()
+    if unknown := set(options.motions) - set(WORLDS):
+        parser.error(f"no motion {sorted(unknown)}; the motions are {'; '.join(WORLDS)}")
     print("| motion | valid | crashes | determined of 9 | RMS of error / u | most | within U, % | beyond 4 u |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for name, world in WORLDS.items():
+    for name in options.motions or WORLDS:
+        world = WORLDS[name]
         if options.online and (world.nominal or world.uniaxial or world.planes > 1):
             continue
         tally = Tally()
