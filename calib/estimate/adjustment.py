@@ -66,7 +66,8 @@ class Grounds:
     @cached_property
     def reasons(self) -> tuple[str, ...]:
         """Why the adjustment is refused, empty if it is not."""
-        return tuple(reasons(self.windows, self.solution, self.shares, self.determined, self._turned))
+        known = self.priors.known.is_stated
+        return tuple(reasons(self.windows, self.solution, self.shares, self.determined, self._turned, known))
 
     def _turned(self, static: int, factor: float) -> Solution:
         turned, _ = excited_together(turned_windows(self.windows, static, factor))

@@ -137,7 +137,7 @@ class Now:
         noise = self.noise.pooled(record)
         degrees = Degrees.of(self.unknowns, self.seen_degc, self.x)
         values, around = (self.x, self.around) if at is None else (at, at)
-        (rows,) = Rows(self.unknowns, [record], np.array([self.day]), noise, degrees).at(values[None], around[None])
+        (rows,) = Rows(self.unknowns, [record], np.array([self.day]), [noise], degrees).at(values[None], around[None])
         if at is not None:
             rows[:, -1] += rows[:, :-1] @ (at - self.x)
         return np.asarray(rows[np.abs(rows[:, :-1]).max(axis=1, initial=0.0) > 0.0])
@@ -212,11 +212,11 @@ class Then:
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """`days` (K,) of the epochs, `x` (K, N) the point of linearisation, `root` the triangle of the last epoch, `links`
-    those between epochs. `epoch_of` (W,) and `rows`: the epoch and the rows of each record."""
+    those between epochs. `noise` (W), `epoch_of` (W,) and `rows`: the noise, the epoch and the rows of each record."""
 
     unknowns: Unknowns
     records: Sequence[Record]
-    noise: Noise
+    noise: Sequence[Noise]
     seen_degc: Seen
     days: Array
     epoch_of: Index
@@ -233,7 +233,7 @@ class Estimate:
         """What is known at the last epoch."""
         return Now(
             self.unknowns,
-            self.noise,
+            self.noise[-1] if self.noise else Noise(),
             self.seen_degc,
             float(self.days[-1]),
             self.x[-1],
@@ -260,14 +260,15 @@ class Estimate:
         if record.setting not in self.unknowns or record.day <= self.days[-1]:
             return None
         record = together([*self.records, record], fixed=self.unknowns.statements.held_mps2 is not None)[-1]
-        ahead, noise = self.now.passed_to(record.day), self.noise.pooled(record)
+        now = self.now
+        ahead, noise = now.passed_to(record.day), now.noise.pooled(record)
         degrees, days = Degrees.of(self.unknowns, self.seen_degc, ahead.x), np.append(self.days, record.day)
-        (rows,) = Rows(self.unknowns, [record], days[-1:], noise, degrees).at(ahead.x[None], ahead.around[None])
+        (rows,) = Rows(self.unknowns, [record], days[-1:], [noise], degrees).at(ahead.x[None], ahead.around[None])
         root, link = passed(self.root, self.unknowns.passage(float(self.days[-1]), record.day)[2], rows)
         return replace(
-            self, records=[*self.records, record], noise=noise, days=days, root=root, links=[*self.links, link],
-            epoch_of=np.append(self.epoch_of, len(days) - 1), x=np.vstack([self.x, ahead.x]),
-            around=np.vstack([self.around, ahead.around]), rows=[*self.rows, rows],
+            self, records=[*self.records, record], noise=[*self.noise, noise], days=days, root=root,
+            links=[*self.links, link], epoch_of=np.append(self.epoch_of, len(days) - 1),
+            x=np.vstack([self.x, ahead.x]), around=np.vstack([self.around, ahead.around]), rows=[*self.rows, rows],
         )  # fmt: skip
 
     def budget(self, by: Array) -> dict[str, Array]:
@@ -303,13 +304,16 @@ def estimate(
     *,
     start: Now | None = None,
     also: Sequence[float] = (),
-    noise: Noise | None = None,
+    beside: Sequence[Record] = (),
 ) -> Estimate:
     """Everything, from the records and the statements alone.
 
     `start`: where the passes begin, if not at the priors; it does not change the result. `also`: days that get an epoch
-    with or without a window. `noise`: None pools that of the records.
+    with or without a window. `beside`: further records, which only tell how noisy those near them are.
     """
+    every = sorted([(r.day, True, r) for r in records] + [(r.day, False, r) for r in beside], key=lambda each: each[0])
+    around = Noise.around([r for *_, r in every])
+    noise = [own for (_, counts, _), own in zip(every, around, strict=True) if counts]
     records = together(sorted(records, key=lambda r: r.day), fixed=statements.held_mps2 is not None)
     unknowns = Unknowns(statements, records)
     stated = [d.day for d in statements.dated] + unknowns.rates_begin
@@ -317,7 +321,7 @@ def estimate(
     days = distinct(np.array([*(r.day for r in records), *stated, *also], dtype=np.float64))
     if not len(days):
         days = np.array([unknowns.begin])
-    solution = _Solution(unknowns, records, days, noise or Noise.of(records), _seen(records))
+    solution = _Solution(unknowns, records, days, noise, _seen(records))
     return solution.solved(start)
 
 
@@ -330,7 +334,7 @@ class _Solution:
     """The passes of one estimate."""
 
     def __init__(
-        self, unknowns: Unknowns, records: Sequence[Record], days: Array, noise: Noise, seen_degc: Seen
+        self, unknowns: Unknowns, records: Sequence[Record], days: Array, noise: Sequence[Noise], seen_degc: Seen
     ) -> None:
         self.unknowns, self.records, self.days, self.noise, self.seen_degc = unknowns, records, days, noise, seen_degc
         self.epoch_of = np.searchsorted(days, [r.day for r in records])

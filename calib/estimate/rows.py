@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 
@@ -24,10 +25,15 @@ from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, LEVELS, SUMS,
 from calib.estimate.unknowns import Unknowns
 from calib.model import Array, own_channels
 
+# Of a pool of noise: a window tells half as much of the noise of another one with so many windows between them. Noise
+# changes with traffic, weather and the season; 100 windows of ten segments know a variance to 5 %.
+HALF_WINDOWS = 100.0
+
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """How much slopes and means scatter, by all windows: `scores` (2, LEVELS, SUMS) (calib.estimate.type_a).
+    """How much slopes and means of a window scatter, by it and those near it: `scores` (2, LEVELS, SUMS) of
+    calib.estimate.type_a, summed.
 
     Where segments are few, the rest is what a filter makes of white noise.
     """
@@ -35,13 +41,18 @@ class Noise:
     scores: Array = field(default_factory=lambda: np.zeros((2, LEVELS, SUMS)))
 
     @classmethod
-    def of(cls, records: Sequence[Record]) -> Noise:
-        """That of all records."""
-        return cls(np.sum([record.scores for record in records], axis=0)) if records else cls()
+    def around(cls, records: Sequence[Record]) -> list[Noise]:
+        """That of each of the records, which are in the order of their days."""
+        before, after = cls._one_way(records), cls._one_way(records[::-1])[::-1]
+        return [cls(a.scores + b.scores - r.scores) for a, b, r in zip(before, after, records, strict=True)]
+
+    @classmethod
+    def _one_way(cls, records: Sequence[Record]) -> list[Noise]:
+        return list(accumulate(records, cls.pooled, initial=cls()))[1:]
 
     def pooled(self, record: Record) -> Noise:
-        """With one more record."""
-        return Noise(self.scores + record.scores)
+        """That of the next record."""
+        return Noise(self.scores * 0.5 ** (record.windows / HALF_WINDOWS) + record.scores)
 
     @cached_property
     def _found(self) -> tuple[Scattered | None, Scattered | None]:
@@ -116,10 +127,16 @@ CORRECTION, UNSEEN = "correction for the reference's noise", "directions without
 
 
 class Rows:
-    """The rows of records as functions of the unknowns. `epoch_day` (W,) is the day of the epoch of each."""
+    """The rows of W records as functions of the unknowns. `epoch_day` (W,) is the day of the epoch of each, `noise`
+    (W) its noise."""
 
     def __init__(
-        self, unknowns: Unknowns, records: Sequence[Record], epoch_day: Array, noise: Noise, degrees: Degrees
+        self,
+        unknowns: Unknowns,
+        records: Sequence[Record],
+        epoch_day: Array,
+        noise: Sequence[Noise],
+        degrees: Degrees,
     ) -> None:
         s, by = unknowns.statements, dict[tuple[int, int, float, float, float, bool], list[int]]()
         for w, r in enumerate(records):
@@ -134,10 +151,8 @@ class Rows:
             windows = Windows(stack, degc, nominal, held, at_hz=hz, share=share, known_size=size)
             pairs = [unknowns.effect(records[w], float(epoch_day[w])) for w in at]
             effect, taken_out = np.array([e for e, _ in pairs]), np.array([a for _, a in pairs])
-            slopes, means = (
-                _Slopes(own, windows, unknowns, noise, degrees),
-                _Means(own, windows, unknowns, noise, degrees),
-            )
+            near = [noise[w] for w in at]
+            slopes, means = (made(own, windows, unknowns, near, degrees) for made in (_Slopes, _Means))
             by_bands = _told(own) if told else None
             self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, by_bands))
 
@@ -212,7 +227,7 @@ class _Slopes:
     """By what the slopes of W windows are multiplied, so that their covariance is one: `weights` (W, 6M, 6M)."""
 
     def __init__(
-        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise, degrees: Degrees
+        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Sequence[Noise], degrees: Degrees
     ) -> None:
         s, n, own = unknowns.statements, 6 * windows.channels, windows.stack
         merged, self._stretch = _merged(records)
@@ -220,7 +235,7 @@ class _Slopes:
         u_lag_s = [max(p.lag_window_s, r.u_lag_s) * (p.lag_s > 0.0) for p, r in zip(priors, records, strict=True)]
         u = np.array([u_lag_s, [r.attenuation for r in records]]).T / np.sqrt(merged)[:, None]
         self._loaded = np.array([r.loadings for r in records]).mT * u[:, None]
-        self._white = _white(noise.slopes, records)
+        self._white = _white([own.slopes for own in noise], records)
         # What nobody knows of S along directions that were not excited, by the little that moved there.
         unknown = np.minimum(s.u[:9], FLAT * s.scale).reshape(3, 3)
         silent = windows.moved @ (np.eye(3) - own.excited)
@@ -274,11 +289,11 @@ class _Means:
     nobody stated gravity."""
 
     def __init__(
-        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Noise, degrees: Degrees
+        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Sequence[Noise], degrees: Degrees
     ) -> None:
         s, k = unknowns.statements, windows.stack.means.shape[1]
         merged, stretch = _merged(records)
-        self._white = _white(noise.means, records)[:, None] * windows.stack.noise**2
+        self._white = _white([own.means for own in noise], records)[:, None] * windows.stack.noise**2
         self._white *= (merged / np.array([r.count for r in records]))[:, None]
         between = np.array([(s.of(r.reference).offset_mps2 * s.scale) ** 2 for r in records])
         self._between = between[:, None] + np.zeros(3)
@@ -300,9 +315,9 @@ class _Means:
         return shares | {TEMPERATURE: np.einsum("wkim,wij,wkjm->m", moved, self._degrees, moved)}
 
 
-def _white(ratio: float, records: Sequence[Record]) -> Array:
+def _white(ratios: Sequence[float], records: Sequence[Record]) -> Array:
     """(W,) variance over that of white noise of the points that filters leave independent."""
-    return np.maximum(ratio / np.array([r.independent for r in records]), LEAST_INFLATION)
+    return np.maximum(np.array(ratios) / np.array([r.independent for r in records]), LEAST_INFLATION)
 
 
 def _merged(records: Sequence[Record]) -> tuple[Array, Array]:

@@ -38,7 +38,6 @@ from calib.estimate.quantities import (
 from calib.estimate.record import Record, together
 from calib.estimate.reference_share import ReferenceShare, share_in
 from calib.estimate.response_told import ResponseTold
-from calib.estimate.rows import Noise
 from calib.estimate.sources import Sources
 from calib.estimate.statements import DOUBT, Dated, Statements, Step, Widening
 from calib.estimate.thinning import NEWEST, thinned
@@ -142,12 +141,12 @@ class State:
             return self._temperature
         return replace(self._temperature, reference_degc=self._zero_degc)
 
-    def estimate(self, noise: Noise | None = None, also: Sequence[float] = ()) -> Estimate:
-        """The whole solved anew, the past as well; `noise`: None pools that of the records. `also`: further epochs."""
+    def estimate(self, beside: Sequence[Record] = (), also: Sequence[float] = ()) -> Estimate:
+        """The whole solved anew, the past as well; `beside`, `also`: as of `calib.estimate.estimate.estimate`."""
         days = [max(r.day for r in self._records)] if self._records else []
         days += [step.day for step in self._steps if days and step.day > days[0]]
         start = self._now if self._records else None
-        return estimate(self._records, self.statements, start=start, also=[*days, *also], noise=noise)
+        return estimate(self._records, self.statements, start=start, also=[*days, *also], beside=beside)
 
     def with_body(self, record: Record) -> Record:
         """A window with the temperature of a body that follows the told one late (Record.behind_k)."""
@@ -471,7 +470,7 @@ class State:
 
     def chi2_beside(self, records: Sequence[Record]) -> float:
         """That of this state alone with the noise of these records pooled in: what `after` is compared with."""
-        return self.estimate(Noise.of([*self._records, *records])).chi2
+        return self.estimate(beside=records).chi2
 
     def changes(
         self,

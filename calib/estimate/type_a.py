@@ -173,10 +173,12 @@ def scattered(sums: Array) -> Scattered | None:
     ):
         if freedom < 1.0 or not dimensions:
             return None
-        variance, matrix = total / freedom, np.array([[own, -2.0 * ends], [-ends, neighbours]])
-        if abs(np.linalg.det(matrix)) < SINGULAR:
+        # own gamma0 - 2 ends gamma1 = square, neighbours gamma1 - ends gamma0 = product
+        variance, determinant = total / freedom, own * neighbours - 2.0 * ends**2
+        if abs(determinant) < SINGULAR:
             return Scattered(level, variance, 1.0, freedom)
-        gamma0, gamma1 = np.linalg.solve(matrix, [square, product]).tolist()
+        gamma0 = (neighbours * square + 2.0 * ends * product) / determinant
+        gamma1 = (ends * square + own * product) / determinant
         if gamma0 <= 0.0:
             return Scattered(level, variance, 1.0, freedom)
         rho, typical = gamma1 / gamma0, segments / windows

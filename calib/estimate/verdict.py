@@ -37,10 +37,12 @@ def reasons(
     shares: Budget,
     determined: Flags,
     turned: Callable[[int, float], Solution],
+    known_filters: bool,
 ) -> list[str]:
     """The reasons why the adjustment is refused, each with its numbers; empty if it is accepted.
 
     `turned(static, factor)` solves again with gravity multiplied by the sign `static` and the reference by `factor`.
+    `known_filters`: those of sensor and reference are stated, so that the data may contradict them.
     """
     return (
         _number_reasons(solution, shares.covariance)
@@ -51,6 +53,7 @@ def reasons(
         or response_reasons(shares)
         or [*_prior_reasons(solution), *_misfit_reasons(solution)]
         or _nuisance_reasons(solution, shares.covariance)
+        or (_filter_reasons(solution) if known_filters else [])
         or nothing_determined(solution, determined)
         or _sensitivity_reasons(solution, shares, determined)
         or _short_reasons(windows)
@@ -246,6 +249,18 @@ def nuisance_pull(solution: Solution, covariance: Array) -> tuple[float, float, 
     )
     limit = STATED_TIMES * float(np.sqrt(chi2_quantile(single, 1.0)))
     return float(found.max(initial=0.0)), limit, told
+
+
+def _filter_reasons(solution: Solution) -> list[str]:
+    """Whether the data contradict the filters that are stated: with a resonance, slopes on u and on du/dt have no S and
+    no lag in common, whatever their size."""
+    limit = GROSS * solution.residual.size
+    if solution.chi2 <= limit:
+        return []
+    return [
+        f"the data contradict the stated filters of sensor and reference: chi-squared {solution.chi2:.4g}, limit "
+        f"{limit:.4g}; look for a resonance or another filter, and calibrate with motion at lower frequencies"
+    ]
 
 
 def _nuisance_reasons(solution: Solution, covariance: Array) -> list[str]:

@@ -165,10 +165,23 @@ def test_noise_that_correlates_is_pooled_over_windows_as_sums() -> None:
     of 12 segments cannot tell how neighbours correlate: ratios of single windows gave 8.9, and 0.70 of u of S_zx."""
     random = np.random.default_rng(5)
     windows = clamp_points(random, Faults(0.003, 0.001, {}, 0.02, 4e-4, 0.02, 0.9), repetitions=12).windows
-    noise = Noise.of([Record.of(window, 0.0) for window in windows])
+    noise = Noise.around([Record.of(window, 0.0) for window in windows])[-1]
     # By 160 degrees of freedom a variance is known to 11 %.
     assert noise.means == pytest.approx(19.0, rel=0.3)
     assert 100.0 < noise.degrees_of_freedom < 250.0
     at_once = condense([excited(window) for window in windows]).type_a
     assert noise.slopes == pytest.approx(at_once.slope_ratio(np.ones(6, dtype=bool)), rel=0.07)
     assert noise.means == pytest.approx(float(np.diag(at_once.means).mean()), rel=0.07)
+
+
+def test_noise_is_pooled_over_windows_nearby() -> None:
+    """Noise is white at first, and AR(1) of 0.9 later. Pooled over all windows, the variance of the means would be 10
+    in both: u of the new windows would be 0.7 of what it is, and that of the old ones 3 times."""
+    random, records = np.random.default_rng(6), list[Record]()
+    for phi in (0.0, 0.9):
+        made = clamp_points(random, Faults(phi=phi), repetitions=12).windows
+        records += [Record.of(window, 0.0) for window in made] * 20
+    noise = [own.means for own in Noise.around(records)]
+    assert noise[0] == pytest.approx(1.0, rel=0.3)  # by 160 degrees of freedom
+    assert noise[-1] == pytest.approx(19.0, rel=0.3)
+    assert noise[len(noise) // 2] == pytest.approx(10.0, rel=0.3)

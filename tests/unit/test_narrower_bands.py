@@ -14,6 +14,7 @@ from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome
 from calib.signal.band import without_slow
+from calib.signal.known_response import known_of
 from tests.pair import Complex, Filter, Pair, decimator, flat, lowpass, pair, resonance
 
 U_REFERENCE = 1e-3
@@ -61,6 +62,16 @@ def test_a_resonance_that_hides_the_motion_in_all_windows() -> None:
     assert over_u < 1.0
     again = adjusted(made.files, Priors(reference=U_REFERENCE), band_hz=found.more["band_hz"])
     np.testing.assert_array_equal(again.values, found.values)  # what was tried before leaves no trace
+
+
+def test_a_resonance_contradicts_filters_that_are_stated_flat() -> None:
+    """The reference's resonance of Q 33 at 2.8 Hz, in motion to 10 Hz: with filters stated flat S was valid and -19.8
+    +- 1.0, and the refusal without them said to state so."""
+    own = resonance(2.8352614484851757, 33.43576076232283)
+    made = pair(25, band_hz=(0.5, 10.0), rate_hz=100.0, seconds=60.0, skirts=4, response=lambda f: 1.0 / own(f))
+    flat_filters = Priors(reference=1e-3).beside_known(known_of(["flat"], ["flat"]))
+    (reason,) = adjusted(made.files, flat_filters).reasons
+    assert reason.startswith("the data contradict the stated filters of sensor and reference: chi-squared ")
 
 
 def test_motion_that_fills_the_spectrum_is_no_noise_of_the_reference() -> None:

@@ -64,7 +64,7 @@ class Linear:
         whole, day = self.whole, self.whole.days[w : w + 1]
         other = replace(record, **{name: getattr(record, name) + error})
         degrees = Degrees.of(whole.unknowns, whole.seen_degc, x[0])
-        rows, moved = (Rows(whole.unknowns, [r], day, whole.noise, degrees).at(x, x)[0] for r in (record, other))
+        rows, moved = (Rows(whole.unknowns, [r], day, [whole.noise[w]], degrees).at(x, x)[0] for r in (record, other))
         return int(self._first[w]), moved[:, -1] - rows[:, -1]
 
 
@@ -91,8 +91,8 @@ def test_lags_of_windows_have_a_share_where_they_are_stated(clamped: list[Record
 
 
 def test_noise_has_the_share_by_which_it_moves_s_and_q(clamped: list[Record]) -> None:
-    linear, noise, errors = Linear(clamped), Noise.of(clamped), []
-    for w, record in enumerate(clamped):
+    linear, errors = Linear(clamped), []
+    for w, (record, noise) in enumerate(zip(clamped, Noise.around(clamped), strict=True)):
         of_slopes, of_means = (
             record.noise * np.sqrt(max(ratio / record.independent, LEAST_INFLATION))
             for ratio in (noise.slopes, noise.means)

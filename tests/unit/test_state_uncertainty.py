@@ -131,7 +131,7 @@ def test_a_window_at_another_time_than_its_epoch_has_what_drifted_meanwhile() ->
     x[unknowns.at["Qz_rate"]] = 0.5
 
     def seen(epoch: float, values: np.ndarray) -> np.ndarray:
-        rows = Rows(unknowns, [own], np.array([epoch]), Noise(), Degrees((0.0, 0.0), np.zeros((2, 3))))
+        rows = Rows(unknowns, [own], np.array([epoch]), [Noise()], Degrees((0.0, 0.0), np.zeros((2, 3))))
         return np.asarray(rows.at(values[None], values[None])[0][:, -1])
 
     moved = x.copy()

@@ -37,7 +37,7 @@ def test_the_noise_of_a_window_is_that_of_its_points() -> None:
     own = Record.of(building_window(random, level_mps2=LEVEL, noise_mps2=0.02), 0.0)
     np.testing.assert_allclose(own.noise, 0.02, rtol=0.05)  # 3000 points: 1.3 % is one standard deviation
     # Segments move by their own part of the motion; what is left of them scatters as white noise does.
-    pooled = Noise.of([own])
+    (pooled,) = Noise.around([own])
     assert 0.5 < pooled.means < 1.5
     assert 0.5 < pooled.slopes < 1.5
 
