@@ -152,7 +152,8 @@ class Rows:
             pairs = [unknowns.effect(records[w], float(epoch_day[w])) for w in at]
             effect, taken_out = np.array([e for e, _ in pairs]), np.array([a for _, a in pairs])
             near = [noise[w] for w in at]
-            slopes, means = (made(own, windows, unknowns, near, degrees) for made in (_Slopes, _Means))
+            slopes = _Slopes(own, windows, unknowns, near, degrees)
+            means = _Means(own, windows, unknowns, near, degrees)
             by_bands = _told(own) if told else None
             self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, by_bands))
 
@@ -317,7 +318,7 @@ class _Means:
 
 def _white(ratios: Sequence[float], records: Sequence[Record]) -> Array:
     """(W,) variance over that of white noise of the points that filters leave independent."""
-    return np.maximum(np.array(ratios) / np.array([r.independent for r in records]), LEAST_INFLATION)
+    return np.asarray(np.maximum(np.array(ratios) / [r.independent for r in records], LEAST_INFLATION))
 
 
 def _merged(records: Sequence[Record]) -> tuple[Array, Array]:
