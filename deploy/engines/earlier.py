@@ -62,6 +62,8 @@ REVISIONS = (
     Revision(11, "46e5f60074dd", "0.2.0"),
     # The last before noise is pooled as sums over windows.
     Revision(12, "f21d15057af9", "0.2.0"),
+    # The last before noise is pooled over windows nearby.
+    Revision(13, "d383a3c8cd5e", "0.2.0"),
 )
 
 
