@@ -124,10 +124,10 @@ class OverFrequency:
         low_hz, high_hz = self.motion_hz
         found = f"{self.windows} windows have this band in common{'' if several else ', and may still change it'}"
         if self.fixed:
-            found = "the channel states this band"
+            found = "this band is stated"
         left_out = self.left_out - before.left_out
         lost = f"; {left_out} older windows with motion above it are left out" if left_out else ""
-        remedy = "" if self.fixed else ". Set band_hz of the channel if another band is to be used"
+        remedy = "" if self.fixed else ". Set band_hz if another band is to be used"
         return (
             f"S holds at {self.reference_hz(priors):.3g} Hz and is estimated from motion of {low_hz:.3g} to "
             f"{high_hz:.3g} Hz: {found}{lost}{remedy}"
