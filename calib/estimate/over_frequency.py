@@ -195,7 +195,7 @@ class OverFrequency:
         hz = stated.reference_frequency_hz or self.first_hz
         by_axis = self.left_open.by_axis(self._terms(state, reference), _at_reference(stated))
         between = self.deviations.between.beyond(by_axis.explains)
-        common = {"known filters": priors.known_u, "response between bands": between}
+        common = {"known filters": stated.known_u, "response between bands": between}
         return {**common, "whose noise it is": self.left_open.u_lost(hz)}, by_axis.u
 
     def budget(self, state: Now, reference: str, priors: Priors, by: Array) -> dict[str, Array]:

@@ -18,6 +18,7 @@ from calib.estimate.statements import Dated, Statements, Step
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Calibration, Pose
+from calib.signal.known_response import known_of
 from tests.clamp_windows import G_MPS2
 from tests.drawn_records import UP, Truth, template, told
 
@@ -151,10 +152,15 @@ def test_a_dated_calibration_counts_once() -> None:
 
 
 def test_what_known_filters_leave_open_is_in_the_uncertainty_of_s() -> None:
-    """1 % of each element, common to all of them."""
-    priors = Priors.none().with_values({"known_u": 0.01, "reference_frequency_hz": 2.0})
+    """At half the corner, |h| of a first order is (1 + 1/4)^-0.5, and changes by 0.2 % for each % of the corner. The
+    data tell how much both filters attenuate together; what one of two alike has of it stays open by 1 / sqrt(2)."""
+    filters = ["lowpass order=1 corner_hz=16 u_corner_pct=0.5"]
+    priors = Priors.none().beside_known(known_of(filters, filters))
     now = estimate([record()], Statements(MEAN, U, {"": priors}, Wander(STILL), TemperatureModel())).now
-    more = OverFrequency().factor(now, "A", priors)[:12]
+    over = OverFrequency(first_hz=8.0, late_s=0.0)
+    more = over.factor(now, "A", priors)[:12]
     grown = more @ more.T - now.factor[:12] @ now.factor[:12].T
-    open_ = np.append(0.01 * S.ravel(), np.zeros(3))
-    np.testing.assert_allclose(grown, np.outer(open_, open_), rtol=1e-4, atol=1e-9)
+    open_ = np.append(0.005 * 0.2 / np.sqrt(2.0) * S.ravel(), np.zeros(3))
+    told = over.budget(now, "A", priors, np.eye(12, len(now)))["known filters"]
+    np.testing.assert_allclose(told, open_**2, rtol=2e-2)
+    np.testing.assert_allclose(grown, np.outer(open_, open_), rtol=2e-2, atol=1e-9)
