@@ -32,6 +32,15 @@ def test_the_variance_of_a_window_of_few_correlated_segments_is_unbiased(rho: fl
     assert found.variance == pytest.approx(5.0 * (1.0 + 2.0 * rho * (1.0 - 1.0 / 5.0)), rel=0.02)
 
 
+def test_a_variance_with_the_covariance_of_neighbours_has_fewer_degrees_of_freedom_than_scores() -> None:
+    """600 drawn variances scatter as those of n degrees of freedom do, whose variance is 2 / n; n known to 6 %. What is
+    told may be 2.2 times too much: the noise of the covariance is in it as if it were half as large."""
+    found = [scattered(score_sums([scores(seed, 40, 20, 0.3)])) for seed in range(600)]
+    variance, told = np.transpose([(one.variance, one.degrees_of_freedom) for one in found if one is not None])
+    shown = 2.0 * variance.mean() ** 2 / variance.var()
+    assert 0.8 * shown < told.mean() < 2.2 * shown
+
+
 def test_the_noise_of_a_window_is_that_of_its_points() -> None:
     random = np.random.default_rng(1)
     own = Record.of(building_window(random, level_mps2=LEVEL, noise_mps2=0.02), 0.0)
