@@ -53,7 +53,7 @@ class OverFrequency:
 
     def stated(self, priors: Priors) -> Priors:
         """The priors with those of the response, once it is an unknown."""
-        if self.motion_hz is not None and priors.response_hz == self.to_hz:
+        if self.motion_hz is not None and priors.response_model.to_hz == self.to_hz:
             return priors  # they have them already
         if self.at_hz and not priors.reference_frequency_hz:
             priors = priors.with_values({"reference_frequency_hz": self.at_hz})

@@ -320,11 +320,7 @@ OF_SENSOR = (
     SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE, SENSITIVITY_BEHIND, OFFSET_BEHIND,
 )  # fmt: skip
 FREQUENCIES = (
-    Statement("response_hz"),  # to which the terms of the response are scaled
-    Statement("response_from_hz"),  # to which those below the motion are scaled
-    Statement("corner_unknown"),  # 1 where an instrument is AC-coupled and nobody states its corner
     *map(Statement, ("known_size", "known_u", "reference_share")),  # see calib.estimate.nuisances.Priors
-    Statement("response_terms", 5.0),  # how many of them are unknowns: one frequency tells c_2 alone
     Statement("reference_frequency_hz"),  # at which S holds
 )
 PRIORS = by_name(
