@@ -9,11 +9,12 @@ import pytest
 
 from calib.estimate.record import Record
 from calib.estimate.rows import Noise
-from calib.estimate.type_a import scattered, score_sums
+from calib.estimate.type_a import LEVELS, SUMS, scattered, score_sums
 from tests.building_windows import building_window
 from tests.clamp_windows import S_TRUE
 
 LEVEL = (0.1, 0.1, 0.1)
+NO_SCORES = np.zeros((2, LEVELS, SUMS))
 
 
 def scores(seed: int, windows: int, segments: int, rho: float, size: int = 1) -> np.ndarray:
@@ -39,6 +40,12 @@ def test_a_variance_with_the_covariance_of_neighbours_has_fewer_degrees_of_freed
     variance, told = np.transpose([(one.variance, one.degrees_of_freedom) for one in found if one is not None])
     shown = 2.0 * variance.mean() ** 2 / variance.var()
     assert 0.8 * shown < told.mean() < 2.2 * shown
+
+
+def test_where_no_segments_tell_it_slopes_and_means_scatter_as_white_noise_makes_them() -> None:
+    nothing = replace(Record.of(building_window(np.random.default_rng(3), level_mps2=LEVEL), 0.0), scores=NO_SCORES)
+    pooled = Noise.of([nothing, nothing])
+    assert (pooled.slopes, pooled.means, pooled.degrees_of_freedom) == (1.0, 1.0, 0.0)
 
 
 def test_the_noise_of_a_window_is_that_of_its_points() -> None:
