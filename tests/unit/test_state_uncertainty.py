@@ -104,6 +104,16 @@ def test_chi_squared_is_that_of_what_was_stated_and_seen() -> None:
     assert found.chi2 == pytest.approx(expected, rel=1e-4)
 
 
+def test_a_window_that_is_taken_adds_to_chi_squared_what_it_is_off_its_prediction() -> None:
+    """Three axes, each with an offset of the same prior whose windows scatter: a covariance of two values."""
+    own, scatter = replace(AT_REST, pose=Pose("p", np.eye(3), np.zeros(3))), 0.05
+    found, seen = state({"offset_mps2": scatter}), np.array([0.7, -0.4])
+    for day, by in enumerate(seen):
+        found.update(told(own, Truth(S, Q + by), float(day)))
+    covariance = SCALE**2 * (scatter**2 * np.eye(2) + U_Q**2)
+    assert found.chi2 == pytest.approx(3.0 * seen @ np.linalg.solve(covariance, seen), rel=1e-4)
+
+
 @pytest.mark.parametrize("unit", [1e-9, 1e6])
 def test_the_output_unit_does_not_matter(unit: float) -> None:
     """A sensor whose output is in nV, or in counts: all that is stated of S and Q is in proportion."""
