@@ -14,7 +14,7 @@ from calib.estimate.over_frequency import OverFrequency
 from calib.estimate.record import Record
 from calib.estimate.rows import Degrees, Noise, Rows
 from calib.estimate.state import State
-from calib.estimate.statements import Dated, Statements, Step
+from calib.estimate.statements import Dated, Statements, Step, Widening
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Calibration, Pose
@@ -159,6 +159,17 @@ def test_a_dated_calibration_counts_once() -> None:
     now = estimate([], stated).now
     np.testing.assert_allclose(now.mean[:12], MEAN + U, rtol=1e-9)
     np.testing.assert_allclose(now.variance[:12], 0.5 * U**2, rtol=1e-9)
+
+
+def test_half_of_the_time_of_a_widened_walk_adds_half_of_its_variance() -> None:
+    """The first window tells S, the second one, at rest, nothing of it."""
+    variances = []
+    for widened in ((), (Widening(0.0, 10.0, {"Sxx": 0.02}),)):
+        stated = Statements(
+            MEAN, U, {"": Priors.none()}, Wander(STILL), TemperatureModel(), widened=widened, held_mps2=UP
+        )
+        variances.append(estimate([record(), record(AT_REST, 5.0)], stated).now.variance[:9])
+    np.testing.assert_allclose(variances[1] - variances[0], np.append(0.5 * 0.02**2, np.zeros(8)), rtol=1e-6, atol=1e-9)
 
 
 def test_what_known_filters_leave_open_is_in_the_uncertainty_of_s() -> None:
