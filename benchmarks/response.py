@@ -110,7 +110,7 @@ def one(job: Job) -> Result:
     stated = Priors(
         reference=U_REFERENCE,
         reference_frequency_hz=made.reference_frequency_hz,
-        corner_unknown=float(name in CORNERS),
+        corner_unknown=name in CORNERS,
     )
     found = adjusted(made.files, stated).calibration
     if found is None:

@@ -134,8 +134,8 @@ class Calibration:
 
     `sensitivity` (3, 3) in output unit per m/s2; `offset` (3,) in output unit; `covariance` (12, 12) in the order of
     PARAMETERS (S row by row, then Q). `determined` (12,) is true for each parameter that the data determine
-    (calib.estimate.determined). The others have the posterior value if something was known of them before, as in every
-    agent, and are NaN if not.
+    (calib.estimate.determined). The others have the posterior value if something was known of them before, as always on
+    line, and are NaN if not.
     `degrees_of_freedom` are those of the type A part; inf if that part does not limit the coverage factor. `method`
     names the method for people.
     """

@@ -6,16 +6,17 @@ import json
 import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from functools import reduce
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from agent.bench.stops import GRAVITY, Stop, on_clamp, on_faces, turned_by_hand
 from agent.config import Channel
-from calib.estimate.quantities import PRIORS, REFERENCE, YEAR_DAYS
+from agent.config.knowledge import PRIORS
+from calib.estimate import quantities
 from calib.geometry import beside
+from calib.recorded.options import STATED
 from calib.recorded.units import unit_name
 
 Kind = Literal["clamp", "triad", "gravity"]
@@ -67,13 +68,13 @@ def stated(channel: Channel, directory: Path, unit: str) -> list[str]:
         options += [f"--reference-filter={line}" for line in channel.certificate.filters]
     if channel.rotation is not None:
         options += ["--rotation=" + ",".join(map(repr, channel.rotation)), "--reference-coupling=dc"]
-    one_each = {s.option: s for s in PRIORS.values() if s.option and s.configuration}
-    for statement in one_each.values():
-        value = float(reduce(np.hypot, [_at(channel, place) for place in statement.configuration]))
-        if statement is REFERENCE.prior:
+    one_each = {option: name for name, (option, _) in STATED.items() if name in PRIORS}
+    for option, name in one_each.items():
+        value = PRIORS[name].of(channel)  # in the unit of the option
+        if name == "reference":
             value = math.hypot(value, _drifted_pct(channel))
-        if value or statement.default:
-            options.append(f"--{statement.option.replace('_', '-')}={value!r}")
+        if value or quantities.PRIORS[name].default:
+            options.append(f"--{option.replace('_', '-')}={value!r}")
     return options
 
 
@@ -94,10 +95,5 @@ def _drifted_pct(channel: Channel) -> float:
     dated = channel.certificate.date
     if dated is None:
         return 0.0
-    years = max((datetime.now(UTC) - dated).days, 0) / YEAR_DAYS
+    years = max((datetime.now(UTC) - dated).days, 0) / quantities.YEAR_DAYS
     return channel.certificate.stability_pct * math.sqrt(years)
-
-
-def _at(channel: Channel, place: str) -> Any:
-    section, field = place.split(".")
-    return getattr(getattr(channel, section), field)

@@ -164,7 +164,7 @@ def _priors(channel: Channel, nominal: float | None) -> Priors:
     mean = channel.prior.mean(1.0 if nominal is None else nominal)
     stated = channel.priors(fixed_mount=channel.fixed_mount)
     covariance = np.diag(channel.prior.standard_uncertainty(mean) ** 2)
-    return Priors(stated.values, mean, covariance, stated.known)
+    return replace(stated, parameters=mean, covariance=covariance)
 
 
 def _scale(priors: Priors) -> float:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, reduce
+from operator import neg
 from typing import Annotated
 
 import msgspec
@@ -16,7 +18,7 @@ from agent.config.filters import Filters, ResponseTable, stated_by_driver
 from agent.config.gate import DriftOptions, GateSettings
 from agent.config.section import Section, Vector
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import PRIORS, WALKS, YEAR_DAYS, Statement
+from calib.estimate.quantities import YEAR_DAYS, from_deg, from_percent
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array, scale_of
 from calib.signal.instrument import QUANTITIES, Instrument
@@ -243,6 +245,57 @@ class Temperature(Section):
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """The fields of a channel that state one number, as "section.field"; the root of the sum of their squares counts.
+    `convert` converts their unit to that of the estimators."""
+
+    fields: tuple[str, ...]
+    convert: Callable[[float], float] = float
+
+    def of(self, channel: object) -> float:
+        """What the channel states, in the unit of the fields."""
+        places = [field.split(".") for field in self.fields]
+        return float(reduce(np.hypot, [getattr(getattr(channel, section), field) for section, field in places]))
+
+
+def _percent_a_year(walked_pct: float) -> float:
+    return float(from_percent(walked_pct) / np.sqrt(YEAR_DAYS))
+
+
+_ANGLE, _TILT = Setting(("uncertainty.angle_deg",), from_deg), Setting(("uncertainty.tilt_deg",), from_deg)
+# By the names of calib.estimate.nuisances.Priors.
+PRIORS: Mapping[str, Setting] = {
+    "sensor_corner_hz": Setting(("prior.u_corner_hz",)), "sensor_corner_at_hz": Setting(("prior.corner_hz",)),
+    "lag_s": Setting(("uncertainty.lag_s", "certificate.u_lag_s")), "lag_at_s": Setting(("certificate.lag_s",), neg),
+    "theta_rad": Setting(("uncertainty.theta_deg",), from_deg),
+    "theta_position_rad": Setting(("uncertainty.theta_position_deg",), from_deg),
+    "alpha_common_rad": Setting(("uncertainty.alpha_common_deg",), from_deg),
+    "angle_rad": _ANGLE, "gravity_direction_rad": _ANGLE,
+    "offset_position_mps2": Setting(("uncertainty.offset_position_mps2",)),
+    "gravity_mps2": Setting(("uncertainty.gravity_mps2",)),
+    "reference": Setting(("certificate.u_sensitivity_pct",), from_percent),
+    "reference_drift": Setting(("certificate.stability_pct",), from_percent),
+    "reference_per_k": Setting(("certificate.u_sensitivity_pct_per_k",), from_percent),
+    "reference_corner_hz": Setting(("certificate.u_corner_hz",)),
+    "reference_corner_at_hz": Setting(("certificate.corner_hz",)),
+    "rotation_rad": Setting(("uncertainty.rotation_deg",), from_deg),
+    "transverse": Setting(("uncertainty.transverse_motion_pct",), from_percent),
+    "offset_mps2": Setting(("uncertainty.offset_mps2",)), "lag_window_s": Setting(("uncertainty.lag_window_s",)),
+    "reference_frequency_hz": Setting(("prior.reference_frequency_hz",)),
+}  # fmt: skip
+AT_FIXED_MOUNT: Mapping[str, Setting] = {**PRIORS, "gravity_direction_rad": _TILT, "lean_rad": _TILT}
+# By the names of calib.estimate.wander.Wander.
+WALKS: Mapping[str, Setting] = {
+    "sensitivity": Setting(("process.sensitivity_pct",), from_percent),
+    "tilt_rad": Setting(("process.tilt_deg",), from_deg),
+    "offset_mps2": Setting(("process.offset_mps2",)),
+    "offset_rate_mps2": Setting(("process.offset_rate_mps2",)),
+    "offset_rate_walk_mps2": Setting(("process.offset_rate_walk_mps2",)),
+    "reference_drift": Setting(("certificate.stability_pct",), _percent_a_year),
+}
+
+
 class Knowledge(Section):
     """Base of a channel: all its sections of what is known beforehand."""
 
@@ -284,25 +337,14 @@ class Knowledge(Section):
 
     def priors(self, *, fixed_mount: bool) -> Priors:
         """The nuisances' priors."""
-        return Priors(self._stated(PRIORS.values(), fixed_mount=fixed_mount)).beside_known(self.known)
+        return Priors(self._stated(AT_FIXED_MOUNT if fixed_mount else PRIORS)).beside_known(self.known)
 
     def wander(self) -> Wander:
         """How fast things may change."""
-        return Wander(self._stated(WALKS.values(), fixed_mount=False))
+        return Wander(self._stated(WALKS))
 
-    def _stated(self, statements: Iterable[Statement], *, fixed_mount: bool) -> dict[str, float]:
-        """What the configuration states of them, by name; the places are in the table of unknowns."""
-        found: dict[str, float] = {}
-        for statement in statements:
-            places = statement.at_fixed_mount if fixed_mount else ()
-            values = [statement.convert(self._at(place)) for place in places or statement.configuration]
-            if values:
-                found[statement.name] = float(reduce(np.hypot, values))
-        return found
-
-    def _at(self, place: str) -> float:
-        section, field = place.split(".")
-        return float(getattr(getattr(self, section), field))
+    def _stated(self, settings: Mapping[str, Setting]) -> dict[str, float]:
+        return {name: setting.convert(setting.of(self)) for name, setting in settings.items()}
 
     def temperature_model(self) -> TemperatureModel:
         """Dependence on temperature."""

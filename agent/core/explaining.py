@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from agent.config import Channel
+from agent.config.knowledge import AT_FIXED_MOUNT, PRIORS, Setting
 from agent.core.gate import Gate
 from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
@@ -110,7 +111,7 @@ def _lines(state: State, jump: Array, fixed_mount: bool) -> dict[str, list[int]]
         kind = quantity.kind
         if quantity.key not in own or quantity.name in ALL_RATES:
             continue
-        stated = kind.source and _settings(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
+        stated = kind.source and _setting(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
         stated = stated or kind is RESPONSE
         if jump[k] > 0.0 if k < len(jump) else stated:
             lines.setdefault(kind.name if k < len(jump) else kind.source, []).append(k)
@@ -173,9 +174,10 @@ def _remedy(best: Explanation, scale: float, channel: Channel, number: int | Non
         )
     if "jump" in kind.loosened_by:
         return f"If the reference is sound: {accept}"
-    assert kind.prior is not None  # see `_lines`
-    least = f"{abs(best.change) / kind.prior.convert(1.0):.2g}"
-    settings = [one for one in _settings(kind, fixed_mount) if _may_be(channel, one, float(least))]
+    setting = _setting(kind, fixed_mount)
+    assert setting is not None  # see `_lines`
+    least = f"{abs(best.change) / setting.convert(1.0):.2g}"
+    settings = [field for field in setting.fields if _may_be(channel, field, float(least))]
     wider = f", or set {' or '.join(settings)} to {least} or more" if settings else ""
     return f"Correct it in the configuration{wider}"
 
@@ -191,11 +193,9 @@ def _may_be(channel: Channel, setting: str, value: float) -> bool:
     return True
 
 
-def _settings(kind: Kind, fixed_mount: bool) -> tuple[str, ...]:
-    """Where the configuration states the kind's uncertainty."""
-    if kind.prior is None:
-        return ()
-    return (kind.prior.at_fixed_mount if fixed_mount else ()) or kind.prior.configuration
+def _setting(kind: Kind, fixed_mount: bool) -> Setting | None:
+    """Where the configuration states the kind's uncertainty; None where it does not."""
+    return None if kind.prior is None else (AT_FIXED_MOUNT if fixed_mount else PRIORS).get(kind.prior.name)
 
 
 def most_likely(innovation: Innovation, scale: float) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,9 +125,8 @@ def _recorded(path: Path, start: RunStart, channel: Channel, infos: dict[str, st
     mean = channel.prior.mean(nominal_of(json.loads(infos[channel.sensor])))
     u = channel.prior.standard_uncertainty(mean)
     u_reference = float(np.hypot(priors.reference, _drifted(start, channel)))
-    stated = Priors(
-        {**priors.values, "reference": u_reference, "reference_drift": 0.0}, mean, np.diag(u**2), priors.known
-    )
+    stated = priors.with_values({"reference": u_reference, "reference_drift": 0.0})
+    stated = replace(stated, parameters=mean, covariance=np.diag(u**2))
     sensor, reference = (_table(path, name) for name in (channel.sensor, channel.reference))
     settings = Settings(Limits.of(priors.offset_mps2, priors.angle_rad, channel.window_s), bands=True)
     name, quantity = str(path), channel.instrument.quantity

@@ -8,7 +8,7 @@ and whether the result may be used (verdict).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -164,9 +164,9 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         priors = _without_offset(priors)
     found, ways = excited_together(used)
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
-    one_frequency = priors.response_terms == 1.0
-    to_hz = np.inf if one_frequency else priors.response_hz
-    data = condense(found, alike=plain, response_hz=to_hz, one_frequency=one_frequency, powers=priors.response_powers)
+    model = priors.response_model
+    to_hz, one = np.inf if model.one_frequency else model.to_hz, model.one_frequency
+    data = condense(found, alike=plain, response_hz=to_hz, one_frequency=one, powers=model.powers)
     if not plain:
         data = effective(data, np.array([w.independent for w in used]))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
@@ -220,15 +220,15 @@ def _response(
 ) -> ResponseTold | None:
     if not priors.response:
         return None
-    one_frequency = priors.response_terms == 1.0
-    band_hz = None if one_frequency else motion_band_hz(windows)
+    model = priors.response_model
+    band_hz = None if model.one_frequency else motion_band_hz(windows)
     if band_hz is None:  # of a broad motion: what is left of it once the response is taken out is too narrow
-        band_hz = (priors.response_hz if one_frequency else priors.reference_frequency_hz, priors.response_hz)
+        band_hz = (model.to_hz if model.one_frequency else priors.reference_frequency_hz, model.to_hz)
     nuisances = solution.equations.nuisances
     own = np.flatnonzero([t.kind is RESPONSE for t in nuisances.terms])
     applied = np.array([nuisances.terms[j].applied for j in own])
     chosen = np.concatenate([np.arange(9), 12 + own])
-    told = told_at_one_frequency if one_frequency else partial(response_told, from_hz=priors.response_from_hz)
+    told = told_at_one_frequency if model.one_frequency else partial(response_told, from_hz=model.from_hz)
     return told(
         np.append(solution.x[:9], solution.x[12 + own] + applied),
         covariance[np.ix_(chosen, chosen)],
@@ -257,7 +257,7 @@ def _without_offset(priors: Priors) -> Priors:
     covariance = priors.covariance.copy()
     covariance[9:, :], covariance[:, 9:] = 0.0, 0.0
     covariance[range(9, 12), range(9, 12)] = np.inf
-    return Priors(priors.values, priors.parameters, covariance, priors.known)
+    return replace(priors, covariance=covariance)
 
 
 def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:

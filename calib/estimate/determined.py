@@ -1,4 +1,4 @@
-"""The decision which parameters the data determine; `fieldcal calibrate` and the agent share it."""
+"""The decision which parameters the data determine; files and streams share it."""
 
 from __future__ import annotations
 

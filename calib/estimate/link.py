@@ -12,7 +12,7 @@ Here x and C are the adjusted values and their covariance; x0 and P are the prio
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,10 +71,10 @@ def link(
         raise ValueError("no window is used")
     rotation = _rotation(used)
     of_site = {"reference_drift": 0.0} | ({} if rotation is None else {"reference": 0.0, "rotation_rad": 0.0})
-    here = Priors({**priors.values, **of_site}, priors.parameters, priors.covariance, priors.known)
+    here = priors.with_values(of_site)
     mean, u = _point(used, here, applied)
     variance = np.append(u[:9] ** 2, np.full(3, np.inf))
-    known = Priors(here.values, mean, np.diag(variance), priors.known)
+    known = replace(here, parameters=mean, covariance=np.diag(variance))
     found = adjust(used, known, applied)
     covariance = found.covariance
     if (drift := drift_of(found, used)) is not None:

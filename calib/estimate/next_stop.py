@@ -175,7 +175,7 @@ class Plan:
         """
         self.poses = tuple(poses)
         channels = poses[0].direction.shape[1]
-        given = Priors({**priors.values, "reference": 0.0, "reference_drift": 0.0}, known=priors.known)
+        given = priors.with_values({"reference": 0.0, "reference_drift": 0.0})
         nuisances = Nuisances(poses, channels, given, Applied())
         mean = np.zeros((len(poses), channels)) if reference_mps2 is None else np.asarray(reference_mps2)
         self._names = [t.key for t in nuisances.terms]

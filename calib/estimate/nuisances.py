@@ -8,7 +8,7 @@ measure is in phase with the motion or 90 deg ahead of it; a table that rocks ca
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -28,7 +28,7 @@ from calib.estimate.quantities import (
 from calib.estimate.terms import terms
 from calib.model import Array, Pose, scale_of
 from calib.signal.known_response import UNKNOWN, KnownResponse
-from calib.signal.response import ALL_POWERS, FLAT, POWERS, Response, by_term
+from calib.signal.response import ALL_POWERS, FLAT, NO_MOTION, Response, ResponseModel, by_term
 
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
 # It is honest for filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
@@ -45,13 +45,16 @@ class Priors(Stated):
     Each number is an attribute; calib.estimate.quantities has the names, units and defaults. A standard uncertainty of
     0 fixes the nuisance at its mean. With `Priors.none()` all are fixed, and the adjustment is plain Method 3 (section
     2.3). `parameters` (12,) and `covariance` (12, 12) are the prior of S and Q in the order of calib.model.PARAMETERS;
-    the diagonal is inf for each parameter without a prior.
+    the diagonal is inf for each parameter without a prior. `response_model`: which terms of the response are unknowns.
+    `corner_unknown`: an instrument is AC-coupled, and nobody states its corner.
     """
 
     table: ClassVar[Mapping[str, Statement]] = PRIORS
     parameters: Array | None = field(default=None, compare=False)
     covariance: Array | None = field(default=None, compare=False)
     known: KnownResponse = field(default=UNKNOWN, compare=False)
+    response_model: ResponseModel = NO_MOTION
+    corner_unknown: bool = False
 
     def __init__(
         self,
@@ -59,6 +62,8 @@ class Priors(Stated):
         parameters: Array | None = None,
         covariance: Array | None = None,
         known: KnownResponse = UNKNOWN,
+        response_model: ResponseModel = NO_MOTION,
+        corner_unknown: bool = False,
         **stated: float,
     ) -> None:
         """`stated` overrides `values`, and `values` override the defaults. Raises TypeError for an unknown name."""
@@ -66,16 +71,18 @@ class Priors(Stated):
         object.__setattr__(self, "parameters", parameters)
         object.__setattr__(self, "covariance", covariance)
         object.__setattr__(self, "known", known)
+        object.__setattr__(self, "response_model", response_model)
+        object.__setattr__(self, "corner_unknown", corner_unknown)
 
     def with_values(self, told: Mapping[str, float]) -> Priors:
         """The same with these values in the place of others."""
-        return Priors({**self.values, **told}, self.parameters, self.covariance, self.known)
+        return replace(self, values={**self.values, **told})
 
     def beside_known(self, known: KnownResponse) -> Priors:
         """These for instruments with filters that are known, and are divided out of the data: all but their delay,
         which is part of the lag."""
         late = {"lag_at_s": self.lag_at_s + known.group_delay_s} if known.is_stated else {}
-        return Priors({**self.values, **late}, self.parameters, self.covariance, known)
+        return replace(self.with_values(late), known=known)
 
     def _known_told(self, frequency_hz: float, to_hz: float = 0.0) -> dict[str, float]:
         """What known filters make of S, if it holds at this frequency, from a motion up to `to_hz`.
@@ -99,13 +106,11 @@ class Priors(Stated):
         middle of the band.
         """
         stated_hz = self.reference_frequency_hz or float(np.sqrt(band_hz[0] * band_hz[1]))
-        told = {
-            "response": min(RESPONSE_U, self.known.u_response(to_hz or band_hz[1])), "response_at": 0.0,
-            "response_terms": float(len(ALL_POWERS if self.corner_unknown else POWERS)),
-            "response_from_hz": (from_hz or band_hz[0]) if self.corner_unknown else 0.0,
-            "response_hz": to_hz or band_hz[1], "reference_frequency_hz": stated_hz,
-        }  # fmt: skip
-        return self.with_values({**told, **self._known_told(stated_hz, to_hz or band_hz[1])})
+        to_hz = to_hz or band_hz[1]
+        model = ResponseModel(to_hz, (from_hz or band_hz[0]) if self.corner_unknown else 0.0)
+        u = min(RESPONSE_U, self.known.u_response(to_hz))
+        told = {"response": u, "response_at": 0.0, "reference_frequency_hz": stated_hz}
+        return replace(self.with_values({**told, **self._known_told(stated_hz, to_hz)}), response_model=model)
 
     @property
     def output_per_mps2(self) -> float | None:
@@ -119,12 +124,7 @@ class Priors(Stated):
     @property
     def beside_unknown_corner(self) -> Priors:
         """These for instruments of which one is AC-coupled, and nobody stated its corner."""
-        return self.with_values({"corner_unknown": 1.0})
-
-    @property
-    def response_powers(self) -> int:
-        """How many powers of the frequency the terms of the response have: 5, or 9 with those below the motion."""
-        return len(ALL_POWERS if self.response_from_hz else POWERS)
+        return replace(self, corner_unknown=True)
 
     def at_one_frequency(self, motion_hz: float, lag_s: float) -> Priors:
         """These and the prior of the response at `motion_hz`, the only frequency of the motion, where the sensor's
@@ -141,11 +141,9 @@ class Priors(Stated):
         if (u_known := float(np.hypot(self.known.u_size(motion_hz), ATTENUATED_U))) < u:
             u, attenuated = u_known, 0.0
         at_hz = self.reference_frequency_hz or motion_hz
-        told = {
-            "response": u, "response_at": attenuated, "response_terms": 1.0, "response_hz": motion_hz,
-            "reference_frequency_hz": at_hz,
-        }  # fmt: skip
-        return self.with_values({**told, **self._known_told(at_hz)})
+        told = {"response": u, "response_at": attenuated, "reference_frequency_hz": at_hz}
+        model = ResponseModel(motion_hz, one_frequency=True)
+        return replace(self.with_values({**told, **self._known_told(at_hz)}), response_model=model)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +198,7 @@ class Nuisances:
         self.effect = np.zeros((len(poses), physics.SIZE, len(self.terms)))
         for j, term in enumerate(self.terms):
             self.effect[:, :, j] = term.on_inputs(len(poses))
-        self.response = self.effect[0, physics.RESPONSE, :].T[:, : priors.response_powers]
+        self.response = self.effect[0, physics.RESPONSE, :].T[:, : priors.response_model.powers]
         self._corners = [
             np.array([0.0 if corner is None else corner[0] for corner in own])
             for own in ([t.reference_corner for t in self.terms], [t.sensor_corner for t in self.terms])
@@ -208,7 +206,7 @@ class Nuisances:
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
         self.reference_frequency_hz, self._known_size = priors.reference_frequency_hz, priors.known_size
         at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
-        self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_powers)[0].real
+        self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_model.powers)[0].real
         self.applied_response = np.array([t.applied for t in self.terms]) @ self.response
 
     def __len__(self) -> int:

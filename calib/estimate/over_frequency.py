@@ -53,7 +53,7 @@ class OverFrequency:
 
     def stated(self, priors: Priors) -> Priors:
         """The priors with those of the response, once it is an unknown."""
-        if self.motion_hz is not None and priors.response_hz == self.to_hz:
+        if self.motion_hz is not None and priors.response_model.to_hz == self.to_hz:
             return priors  # they have them already
         if self.at_hz and not priors.reference_frequency_hz:
             priors = priors.with_values({"reference_frequency_hz": self.at_hz})
@@ -124,10 +124,10 @@ class OverFrequency:
         low_hz, high_hz = self.motion_hz
         found = f"{self.windows} windows have this band in common{'' if several else ', and may still change it'}"
         if self.fixed:
-            found = "the channel states this band"
+            found = "this band is stated"
         left_out = self.left_out - before.left_out
         lost = f"; {left_out} older windows with motion above it are left out" if left_out else ""
-        remedy = "" if self.fixed else ". Set band_hz of the channel if another band is to be used"
+        remedy = "" if self.fixed else ". Set band_hz if another band is to be used"
         return (
             f"S holds at {self.reference_hz(priors):.3g} Hz and is estimated from motion of {low_hz:.3g} to "
             f"{high_hz:.3g} Hz: {found}{lost}{remedy}"
@@ -195,7 +195,7 @@ class OverFrequency:
         hz = stated.reference_frequency_hz or self.first_hz
         by_axis = self.left_open.by_axis(self._terms(state, reference), _at_reference(stated))
         between = self.deviations.between.beyond(by_axis.explains)
-        common = {"known filters": priors.known_u, "response between bands": between}
+        common = {"known filters": stated.known_u, "response between bands": between}
         return {**common, "whose noise it is": self.left_open.u_lost(hz)}, by_axis.u
 
     def budget(self, state: Now, reference: str, priors: Priors, by: Array) -> dict[str, Array]:

@@ -6,7 +6,7 @@ decides anything by the name of an unknown: names are for people and for looking
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
@@ -23,24 +23,14 @@ LINEAR = np.inf  # for an unknown that is not multiplied by S
 YEAR_DAYS = 365.25
 
 
-def _deg(value: float) -> float:
-    return float(np.deg2rad(value))
+def from_deg(angle_deg: float) -> float:
+    """An angle in rad."""
+    return float(np.deg2rad(angle_deg))
 
 
-def _minus(value: float) -> float:
-    return -value
-
-
-def _percent(value: float) -> float:
-    return value / 100.0
-
-
-def _or_0(value: float | None) -> float:
-    return value or 0.0
-
-
-def _percent_a_year(value: float) -> float:
-    return float(value / 100.0 / np.sqrt(YEAR_DAYS))
+def from_percent(share_pct: float) -> float:
+    """A share of 1."""
+    return share_pct / 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,18 +38,11 @@ class Statement:
     """A number that is stated before any data: a standard uncertainty, a mean, or the SD of a random walk.
 
     `name`: the attribute of `calib.estimate.nuisances.Priors` or `calib.estimate.wander.Wander`, with its unit.
-    `default`: its value if it is not stated. `configuration`: its fields in a channel of the configuration, as
-    "section.field"; several are combined as the root of the sum of their squares. `at_fixed_mount`: the fields that are
-    used in their place if the sensor is never turned. `option`: the option of `fieldcal calibrate`. `convert` converts
-    the unit of the field and of the option to the unit of `name`.
+    `default`: its value if it is not stated.
     """
 
     name: str
     default: float = 0.0
-    configuration: tuple[str, ...] = ()
-    at_fixed_mount: tuple[str, ...] = ()
-    option: str = ""
-    convert: Callable[..., float] = float
 
 
 Loosening = Literal["jump", "lean", "line", "filter", "remount"]
@@ -178,16 +161,16 @@ SENSITIVITY = Kind(
     "sensitivity",
     source=PRIOR,
     walked_source=WALK,
-    walk=Statement("sensitivity", 1.8e-4, ("process.sensitivity_pct",), convert=_percent),
+    walk=Statement("sensitivity", 1.8e-4),
     in_output_unit=True,
     loosened_by=("jump",),
 )
-TILT_WALK = Statement("tilt_rad", 3.5e-5, ("process.tilt_deg",), convert=_deg)
+TILT_WALK = Statement("tilt_rad", 3.5e-5)
 OFFSET = Kind(
     "offset",
     source=PRIOR,
     walked_source=WALK,
-    walk=Statement("offset_mps2", 0.002, ("process.offset_mps2",)),
+    walk=Statement("offset_mps2", 0.002),
     in_output_unit=True,
     loosened_by=("jump",),
     straight=LINEAR,
@@ -195,8 +178,8 @@ OFFSET = Kind(
 OFFSET_RATE = Kind(
     "offset rate",
     source="rates of S and Q",
-    prior=Statement("offset_rate_mps2", 0.001, ("process.offset_rate_mps2",)),
-    walk=Statement("offset_rate_walk_mps2", 2e-5, ("process.offset_rate_walk_mps2",)),
+    prior=Statement("offset_rate_mps2", 0.001),
+    walk=Statement("offset_rate_walk_mps2", 2e-5),
     in_output_unit=True,
     straight=LINEAR,
 )
@@ -215,15 +198,15 @@ OFFSET_TEMPERATURE = Kind("offset over temperature", source=TEMPERATURE, straigh
 OFFSET_BEHIND = Kind("offset behind temperature", source=TEMPERATURE, straight=LINEAR, per_k="behind")
 SENSOR_CORNER = Kind(
     "sensor corner", "Hz", "corner frequency",
-    prior=Statement("sensor_corner_hz", 0.0, ("prior.u_corner_hz",), option="u_sensor_corner_hz"),
-    mean=Statement("sensor_corner_at_hz", 0.0, ("prior.corner_hz",), option="sensor_corner_hz"),
+    prior=Statement("sensor_corner_hz"),
+    mean=Statement("sensor_corner_at_hz"),
 )  # fmt: skip
 LAG = Kind(
     "lag", "s", "lag",
     # Low-pass filters of sensors and errors of clock fits cause lags of 0.5 to 15 ms. The lags of sensor and reference
     # are one unknown: the time by which the sensor's indications come after the reference's.
-    prior=Statement("lag_s", 0.02, ("uncertainty.lag_s", "certificate.u_lag_s")),
-    mean=Statement("lag_at_s", 0.0, ("certificate.lag_s",), convert=_minus),
+    prior=Statement("lag_s", 0.02),
+    mean=Statement("lag_at_s"),
     loosened_by=("line", "remount"), of_reference=True, straight=STRAIGHT_LAG_S, stated=False,
 )  # fmt: skip
 LAG_OF_AXIS = Kind(
@@ -237,20 +220,16 @@ LAG_OF_AXIS = Kind(
 
 THETA = Kind(
     "theta", "rad", "theta common",
-    prior=Statement("theta_rad", _deg(0.2), ("uncertainty.theta_deg",), option="u_theta_deg", convert=_deg),
+    prior=Statement("theta_rad", from_deg(0.2)),
     loosened_by=("remount",),
 )  # fmt: skip
 THETA_BY_POSITION = Kind(
     "theta by position", "rad", "theta by position",
-    prior=Statement(
-        "theta_position_rad", 0.0, ("uncertainty.theta_position_deg",), option="u_theta_position_deg", convert=_deg
-    ),
+    prior=Statement("theta_position_rad"),
     loosened_by=("remount",),
 )  # fmt: skip
-ALPHA_COMMON = Statement(
-    "alpha_common_rad", _deg(0.1), ("uncertainty.alpha_common_deg",), option="u_alpha_common_deg", convert=_deg
-)
-ANGLE = Statement("angle_rad", _deg(0.2), ("uncertainty.angle_deg",), option="u_angle_deg", convert=_deg)
+ALPHA_COMMON = Statement("alpha_common_rad", from_deg(0.1))
+ANGLE = Statement("angle_rad", from_deg(0.2))
 ALPHA = Kind("alpha", "rad", "alpha common", prior=ALPHA_COMMON, loosened_by=("remount",))
 ALPHA_BY_POSITION = Kind("alpha by position", "rad", "alpha by position", prior=ANGLE, loosened_by=("remount",))
 DIRECTION = Kind("direction", "rad", "direction common", prior=ALPHA_COMMON, loosened_by=("remount",))
@@ -259,35 +238,30 @@ DIRECTION_BY_POSITION = Kind(
 )
 GRAVITY_DIRECTION = Kind(  # only beside a tri-axial reference, whose rotation is an unknown of its own
     "gravity direction by position", "rad", "direction by position",
-    prior=Statement(
-        "gravity_direction_rad", _deg(0.2), ("uncertainty.angle_deg",), ("uncertainty.tilt_deg",),
-        option="u_angle_deg", convert=_deg,
-    ),
+    prior=Statement("gravity_direction_rad", from_deg(0.2)),
     walk=TILT_WALK, loosened_by=("lean", "remount"),
 )  # fmt: skip
 LEAN = Kind(
     # Of a fixed mount with the sensor and its reference on it: gravity turns, the direction of motion does not.
     "lean", "rad", "tilt",
-    prior=Statement("lean_rad", at_fixed_mount=("uncertainty.tilt_deg",), convert=_deg),
+    prior=Statement("lean_rad"),
     walk=TILT_WALK, loosened_by=("lean", "remount"),
 )  # fmt: skip
 TILT = Kind(
     "tilt", "rad", "tilt",
-    prior=Statement("tilt_rad", option="u_tilt_deg", convert=_deg),
+    prior=Statement("tilt_rad"),
     walk=TILT_WALK,
     loosened_by=("remount",),
 )  # fmt: skip
 OFFSET_BY_POSITION = Kind(
     "offset by position", "m/s2", "offset by position",
-    prior=Statement(
-        "offset_position_mps2", 0.0, ("uncertainty.offset_position_mps2",), option="u_offset_position_mps2"
-    ),
+    prior=Statement("offset_position_mps2"),
     straight=LINEAR,
     loosened_by=("remount",),
 )  # fmt: skip
 GRAVITY = Kind(
     "gravity", "m/s2", "gravity",
-    prior=Statement("gravity_mps2", 0.03, ("uncertainty.gravity_mps2",), option="u_gravity_mps2"),
+    prior=Statement("gravity_mps2", 0.03),
     straight=10.0 * STRAIGHT,
 )  # fmt: skip
 
@@ -295,24 +269,24 @@ GRAVITY = Kind(
 
 REFERENCE = Kind(
     "reference sensitivity", "1", "reference sensitivity",
-    prior=Statement("reference", 1e-3, ("certificate.u_sensitivity_pct",), option="u_reference_pct", convert=_percent),
+    prior=Statement("reference", 1e-3),
     of_reference=True,
 )  # fmt: skip
 REFERENCE_DRIFT = Kind(  # beside the constant error of the certificate, whose prior can then be exchanged exactly
     "reference drift", "1", "reference drift",
-    prior=Statement("reference_drift", 0.0, ("certificate.stability_pct",), convert=_percent),
-    walk=Statement("reference_drift", 0.0, ("certificate.stability_pct",), convert=_percent_a_year),
+    prior=Statement("reference_drift"),
+    walk=Statement("reference_drift"),
     of_reference=True, since_certificate=True,
 )  # fmt: skip
 REFERENCE_TEMPERATURE = Kind(  # its certificate holds at the temperature of S and Q
     "reference over temperature", "1/K", "reference over temperature",
-    prior=Statement("reference_per_k", 0.0, ("certificate.u_sensitivity_pct_per_k",), convert=_percent),
+    prior=Statement("reference_per_k"),
     of_reference=True, per_k="above", straight=0.1 * STRAIGHT,
 )  # fmt: skip
 REFERENCE_CORNER = Kind(
     "reference corner", "Hz", "corner frequency",
-    prior=Statement("reference_corner_hz", 0.0, ("certificate.u_corner_hz",), option="u_reference_corner_hz"),
-    mean=Statement("reference_corner_at_hz", 0.0, ("certificate.corner_hz",), option="reference_corner_hz"),
+    prior=Statement("reference_corner_hz"),
+    mean=Statement("reference_corner_at_hz"),
     of_reference=True,
 )  # fmt: skip
 RESPONSE = Kind(
@@ -324,14 +298,12 @@ RESPONSE = Kind(
 )  # fmt: skip
 ROTATION = Kind(
     "mounting rotation", "rad", "mounting rotation",
-    prior=Statement("rotation_rad", _deg(0.2), ("uncertainty.rotation_deg",), option="u_rotation_deg", convert=_deg),
+    prior=Statement("rotation_rad", from_deg(0.2)),
     of_reference=True, of_place=True, loosened_by=("remount",),
 )  # fmt: skip
 TRANSVERSE = Kind(
     "transverse motion", "1", "transverse motion",
-    prior=Statement(
-        "transverse", 1e-2, ("uncertainty.transverse_motion_pct",), option="u_transverse_motion_pct", convert=_percent
-    ),
+    prior=Statement("transverse", 1e-2),
     loosened_by=("remount",),
 )  # fmt: skip
 
@@ -340,22 +312,16 @@ TRANSVERSE = Kind(
 KINDS: Mapping[str, Kind] = {kind.name: kind for kind in list(vars().values()) if isinstance(kind, Kind)}
 # Scatter between windows is no unknown of a state: it is part of the weights of the windows.
 BETWEEN_WINDOWS = (
-    Statement("offset_mps2", 0.05, ("uncertainty.offset_mps2",), option="u_offset_mps2"),
-    Statement("lag_window_s", 0.0, ("uncertainty.lag_window_s",)),  # the data may show a larger one
+    Statement("offset_mps2", 0.05),
+    Statement("lag_window_s"),  # the data may show a larger one
 )
 OF_SENSOR = (
     SENSITIVITY, SENSITIVITY_RATE, OFFSET, OFFSET_RATE,
     SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE, SENSITIVITY_BEHIND, OFFSET_BEHIND,
 )  # fmt: skip
 FREQUENCIES = (
-    Statement("response_hz"),  # to which the terms of the response are scaled
-    Statement("response_from_hz"),  # to which those below the motion are scaled
-    Statement("corner_unknown"),  # 1 where an instrument is AC-coupled and nobody states its corner
     *map(Statement, ("known_size", "known_u", "reference_share")),  # see calib.estimate.nuisances.Priors
-    Statement("response_terms", 5.0),  # how many of them are unknowns: one frequency tells c_2 alone
-    Statement(  # at which S holds
-        "reference_frequency_hz", 0.0, ("prior.reference_frequency_hz",), (), "reference_frequency_hz", _or_0
-    ),
+    Statement("reference_frequency_hz"),  # at which S holds
 )
 PRIORS = by_name(
     [s for k in KINDS.values() if k not in OF_SENSOR for s in k.statements] + [*BETWEEN_WINDOWS, *FREQUENCIES]

@@ -36,7 +36,7 @@ def told_by_band(found: Adjustment, windows: Sequence[Window]) -> ResponseTold |
     """
     told, grounds = found.response, found.grounds
     used = _moved(windows)
-    if told is None or not used or grounds.priors.response_terms == 1.0:
+    if told is None or not used or grounds.priors.response_model.one_frequency:
         return told
     terms, k = grounds.solution.equations.nuisances, PER_OCTAVE * len(told.bands) // 3
     edges_hz = np.geomspace(told.bands[0].low_hz, told.bands[-1].high_hz, k + 1)

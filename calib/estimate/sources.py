@@ -1,4 +1,4 @@
-"""What makes U of S and Q on-line: a standard uncertainty for each source, named as `fieldcal calibrate` names it."""
+"""What makes U of S and Q on-line: a standard uncertainty for each source, named as those of files are."""
 
 from __future__ import annotations
 

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calib.estimate import physics
 from calib.estimate import quantities as kinds
-from calib.estimate.quantities import Kind, Quantity, Stated
+from calib.estimate.quantities import Kind, Quantity
 from calib.model import Array, Pose, own_channels
-from calib.signal.response import ALL_POWERS, POWERS, attenuating, in_units
+
+if TYPE_CHECKING:
+    from calib.estimate.nuisances import Priors
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
 AXES = "xyz"
@@ -114,7 +116,7 @@ class Term:
 
 
 def terms(
-    poses: Sequence[Pose], channels: int, priors: Stated, applied: Mapping[Kind, Sequence[float]], reference: str = ""
+    poses: Sequence[Pose], channels: int, priors: Priors, applied: Mapping[Kind, Sequence[float]], reference: str = ""
 ) -> list[Term]:
     """All nuisances of P poses and a reference with this number of channels; also those whose uncertainty is 0.
 
@@ -127,7 +129,7 @@ def terms(
     return [term.with_applied(applied) for term in found.values()]
 
 
-def _terms(poses: Sequence[Pose], channels: int, priors: Stated, reference: str) -> Iterator[Term]:
+def _terms(poses: Sequence[Pose], channels: int, priors: Priors, reference: str) -> Iterator[Term]:
     yield from _clamp_terms(poses, priors)
     yield from _pose_terms(poses, priors, reference)
     yield from _lean_terms(poses, priors)
@@ -149,19 +151,14 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Stated, reference: str)
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
     if priors.response > 0.0:
-        units = in_units(priors.response_hz, priors.response_from_hz)
-        names = [f"response_{power}" for power in ALL_POWERS[: len(units)]]
-        if priors.response_terms == 1.0:
-            names, units = ["attenuation"], attenuating(priors.response_hz)[:1]  # -ln |h| at the one frequency
-        for n, (name, unit) in enumerate(zip(names, units.tolist(), strict=True)):
-            term = unit * np.eye(max(len(POWERS), len(units)))[n]
-            yield _term(name, kinds.RESPONSE, priors, reference, response=term)
+        for name, unit in priors.response_model.unknowns.items():
+            yield _term(name, kinds.RESPONSE, priors, reference, response=unit)
     turn = np.full(1, 2.0 * np.pi)
     yield _term("reference_corner", kinds.REFERENCE_CORNER, priors, reference, reference_corner=turn)
     yield _term("sensor_corner", kinds.SENSOR_CORNER, priors, sensor_corner=turn)
 
 
-def reference_over_temperature(channels: int, priors: Stated, reference: str) -> Iterator[Term]:
+def reference_over_temperature(channels: int, priors: Priors, reference: str) -> Iterator[Term]:
     """By how much each channel of a reference indicates more for each kelvin over the temperature of S and Q."""
     for name, own in _by_channel("reference_per_k", channels):
         yield _term(name, kinds.REFERENCE_TEMPERATURE, priors, owner=reference, reference=own)
@@ -174,7 +171,7 @@ def _by_channel(name: str, channels: int) -> Iterator[tuple[str, Array]]:
         yield f"{name}{'' if real == 1 else f'_{AXES[m]}'}", np.resize(np.eye(real)[m], channels)
 
 
-def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+def _clamp_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
     """Errors of theta and alpha: common to all positions, and by position."""
     clamped = [p for p, pose in enumerate(poses) if pose.theta_rad is not None]
     if not clamped:
@@ -193,7 +190,7 @@ def _clamp_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
             yield _turned(_at(name, single, poses[p]), max(priors.of(single.prior), u), _only(poses, p, axis[p]))
 
 
-def _pose_terms(poses: Sequence[Pose], priors: Stated, reference: str) -> Iterator[Term]:
+def _pose_terms(poses: Sequence[Pose], priors: Priors, reference: str) -> Iterator[Term]:
     """Errors of stated directions, common and by position, and of the rotation of a tri-axial reference."""
     stated = [p for p, pose in enumerate(poses) if pose.theta_rad is None and own_channels(pose.direction.shape[1]) < 3]
     beside = [p for p, pose in enumerate(poses) if own_channels(pose.direction.shape[1]) == 3]
@@ -213,7 +210,7 @@ def _pose_terms(poses: Sequence[Pose], priors: Stated, reference: str) -> Iterat
                 yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
 
 
-def _lean_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+def _lean_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
     """Lean of the mount with sensor and reference on it: gravity turns, the direction of motion does not."""
     for p, pose in enumerate(poses):
         if own_channels(pose.direction.shape[1]) < 3 and np.any(pose.gravity_mps2):
@@ -222,7 +219,7 @@ def _lean_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
                 yield Term(quantity, priors.of(quantity.kind.prior), turn_gravity=_only(poses, p, k))
 
 
-def _slide_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
+def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
     """Motion transverse to a uniaxial reference, and errors of the angle between gravity and the motion."""
     lateral, vertical, along = (np.zeros((len(poses), 3)) for _ in range(3))
     free = []
@@ -244,7 +241,7 @@ def _slide_terms(poses: Sequence[Pose], priors: Stated) -> Iterator[Term]:
             yield _term(f"tilt_{name}", kinds.TILT, priors, turn_gravity=axis)
 
 
-def _across(name: str, position: str, priors: Stated, way: Array) -> Iterator[Term]:
+def _across(name: str, position: str, priors: Priors, way: Array) -> Iterator[Term]:
     u = priors.of(kinds.TRANSVERSE.prior)
     yield Term(Quantity(name, kinds.TRANSVERSE, position), u, transverse=way)
     yield Term(Quantity(f"{name}_quadrature", kinds.TRANSVERSE, position), u, quadrature=way)
@@ -283,7 +280,7 @@ def _at(name: str, kind: Kind, pose: Pose) -> Quantity:
     return Quantity(f"{name}[{pose.position}]", kind, pose.position)
 
 
-def _term(name: str, kind: Kind, priors: Stated, owner: str = "", **moves: Array) -> Term:
+def _term(name: str, kind: Kind, priors: Priors, owner: str = "", **moves: Array) -> Term:
     """A nuisance that is common to all positions; `moves` are its effects, as fields of Term."""
     return Term(
         Quantity(name, kind, owner=owner), priors.of(kind.prior), expected=priors.of(kind.mean), applied=0.0, **moves

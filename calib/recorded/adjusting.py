@@ -109,8 +109,8 @@ def _with_remedy(outcome: Outcome, tables: Tables, priors: Priors) -> Outcome:
     if _adjusted(tables, priors.beside_known(known_of(["flat"], ["flat"]))).outcome.reasons:
         return outcome
     *others, last = outcome.reasons
-    remedy = "if no filter of sensor and reference matters in the motion's band, state --sensor-filter flat"
-    return replace(outcome, reasons=(*others, f"{last}; {remedy} --reference-filter flat: then the data are accepted"))
+    remedy = "if no filter of sensor and reference matters in the motion's band, state `sensor_filter` flat"
+    return replace(outcome, reasons=(*others, f"{last}; {remedy} `reference_filter` flat: then the data are accepted"))
 
 
 def _repeated(outcome: Outcome, tables: Tables, priors: Priors, band_hz: Band) -> bool:

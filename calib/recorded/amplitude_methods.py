@@ -1,4 +1,4 @@
-"""`fieldcal calibrate --method 1|2`: the paper's methods on amplitudes, from the windows of tables."""
+"""`method` 1 and 2: the paper's methods on amplitudes, from the windows of tables."""
 
 from __future__ import annotations
 

@@ -80,13 +80,13 @@ def si_of(choice: Choice, chosen: Chosen, sensitivity: Sensitivity | None) -> fl
                 f"column {str(chosen.column)!r} is in {chosen.unit}, convert it to m/s2, m/s or m: it is"
             )
         if unit is not None and unit.quantity in ELECTRICAL:
-            raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit}, so --sensitivity is needed, "
-                               "for example --sensitivity '100 mV/g'")  # fmt: skip
+            raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit}, so `sensitivity` is needed, "
+                               "for example `sensitivity` '100 mV/g'")  # fmt: skip
         return 1.0 if unit is None else unit.si
     if unit is not None and unit.quantity not in ELECTRICAL:
-        raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit} already; remove --sensitivity")
+        raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit} already; remove `sensitivity`")
     if not sensitivity.indication:
         return sensitivity.per / sensitivity.value
     if unit is not None and unit.quantity != sensitivity.indication:
-        raise choice.fault(f"--sensitivity is not for {chosen.unit}, the unit of column {str(chosen.column)!r}")
+        raise choice.fault(f"`sensitivity` is not for {chosen.unit}, the unit of column {str(chosen.column)!r}")
     return (1.0 if unit is None else unit.si) * sensitivity.per / sensitivity.value

@@ -1,4 +1,4 @@
-"""`calibrate`: from arrays or DataFrames to S and Q in one call, as `fieldcal calibrate` does it from files."""
+"""`calibrate`: from arrays or DataFrames to S and Q in one call, as files are calibrated."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def calibrate(sensor: Any, reference: Any = None, poses: Any = None, **options: 
     reference: the same with the columns time_s and a (m/s2), v (m/s), d (m), or ax, ay, az (m/s2). None: only rests.
     poses: a DataFrame, or a list with a dict for each pose: start_s, stop_s and theta_deg, alpha_deg | dx, dy, dz |
     axis | gx, gy, gz. None beside a tri-axial reference, and for rests in positions that nobody knows.
-    options: those of `fieldcal calibrate`, with the same defaults (docs/api.md lists them).
+    options: the fields of calib.recorded.options.Options, with their defaults (docs/api.md lists them).
 
     Data that are refused are no exception: the result then has the status "refused" and its reasons. Raises InputError,
     a ValueError, for samples, poses and options that cannot be used.

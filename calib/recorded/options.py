@@ -1,14 +1,15 @@
-"""What a user states for a calibration: the options of `fieldcal calibrate` that name no file, with their defaults."""
+"""What a user states for a calibration: the options, with their defaults."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
 
+from calib.estimate.quantities import from_deg, from_percent
 from calib.model import Array
 from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.errors import OptionError
@@ -25,6 +26,18 @@ CHOICES: Mapping[str, tuple[Any, ...]] = {
 }
 GRAVITY_MPS2 = (9.7, 9.9)
 ABOVE_ZERO = ("nominal", "u_nominal_pct", "reference_frequency_hz")
+# By which option each prior is stated, and what converts the unit of the option to that of the prior.
+STATED: Mapping[str, tuple[str, Callable[[float], float]]] = {
+    "sensor_corner_hz": ("u_sensor_corner_hz", float), "sensor_corner_at_hz": ("sensor_corner_hz", float),
+    "theta_rad": ("u_theta_deg", from_deg), "theta_position_rad": ("u_theta_position_deg", from_deg),
+    "alpha_common_rad": ("u_alpha_common_deg", from_deg), "angle_rad": ("u_angle_deg", from_deg),
+    "gravity_direction_rad": ("u_angle_deg", from_deg), "tilt_rad": ("u_tilt_deg", from_deg),
+    "offset_position_mps2": ("u_offset_position_mps2", float), "gravity_mps2": ("u_gravity_mps2", float),
+    "reference": ("u_reference_pct", from_percent), "reference_corner_hz": ("u_reference_corner_hz", float),
+    "reference_corner_at_hz": ("reference_corner_hz", float), "rotation_rad": ("u_rotation_deg", from_deg),
+    "transverse": ("u_transverse_motion_pct", from_percent), "offset_mps2": ("u_offset_mps2", float),
+    "reference_frequency_hz": ("reference_frequency_hz", float),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import PRIORS
 from calib.geometry import u_of_gravity_mps2
 from calib.model import PARAMETERS, Array, Calibration
 from calib.recorded.errors import OptionError
-from calib.recorded.options import Options
+from calib.recorded.options import STATED, Options
 from calib.signal.instrument import Instrument
 from calib.signal.known_response import KnownResponse, known_of
 
@@ -29,7 +28,7 @@ def priors_of(options: Options) -> Priors:
     """The options u_..., nominal and prior as priors."""
     parameters, covariance = _known(options)
     told = replace(options, u_gravity_mps2=u_gravity_mps2(options))
-    stated = {s.name: s.convert(getattr(told, s.option)) for s in PRIORS.values() if s.option}
+    stated = {name: convert(getattr(told, option) or 0.0) for name, (option, convert) in STATED.items()}
     return Priors(stated, parameters, covariance).beside_known(known_response(options))
 
 

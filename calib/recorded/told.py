@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.estimate.quantities import BETWEEN_WINDOWS, KINDS
 from calib.model import PARAMETERS, Array
+from calib.recorded.options import STATED
 from calib.recorded.output_unit import shown_in
 from calib.rounding import KNOWN_BEFORE, aligned, plus_minus, rounded
 
@@ -115,7 +116,7 @@ def way_of(source: str) -> str:
     """What makes a source of the uncertainty smaller."""
     stated = [kind.prior for kind in KINDS.values() if kind.source == source]
     stated += [s for s in BETWEEN_WINDOWS if source == "offset between windows" and s.name == "offset_mps2"]
-    options = dict.fromkeys(f"`{s.option}`" for s in stated if s is not None and s.option)
+    options = dict.fromkeys(f"`{STATED[s.name][0]}`" for s in stated if s is not None and s.name in STATED)
     return ", ".join(options) or _WAYS.get(source, "")
 
 

@@ -1,4 +1,4 @@
-"""What a reference measures, described once: for files and for an agent alike."""
+"""What a reference measures, described once: for files and streams alike."""
 
 from __future__ import annotations
 

@@ -110,6 +110,32 @@ def attenuating(frequency_hz: float) -> Array:
     return np.asarray(np.eye(1, len(POWERS))[0] / (2.0 * np.pi * frequency_hz) ** 2)
 
 
+@dataclass(frozen=True, slots=True)
+class ResponseModel:
+    """Which terms of a response are unknowns: those of a motion up to `to_hz`, and those below it, where `from_hz` says
+    where it begins. `one_frequency`: the motion has only that of `to_hz`, which tells |h| alone."""
+
+    to_hz: float = 0.0
+    from_hz: float = 0.0
+    one_frequency: bool = False
+
+    @property
+    def powers(self) -> int:
+        """How many powers of the frequency the terms have: 5, or 9 with those below the motion."""
+        return len(ALL_POWERS if self.from_hz else POWERS)
+
+    @property
+    def unknowns(self) -> dict[str, Array]:
+        """By name, the terms (5,) or (9,) of one unit of each unknown."""
+        if self.one_frequency:
+            return {"attenuation": attenuating(self.to_hz)}  # -ln |h| there
+        units = np.diag(in_units(self.to_hz, self.from_hz))
+        return {f"response_{power}": unit for power, unit in zip(ALL_POWERS, units, strict=False)}
+
+
+NO_MOTION = ResponseModel()  # no motion is known yet
+
+
 def by_term(omega: Array, count: int = len(POWERS)) -> Complex:
     """(i omega)^k (..., count) for angular frequencies (...,): the derivatives of ln h by the first `count` terms.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,17 @@ def test_the_scatter_of_means_is_the_one_that_400_windows_show(phi):
     assert shown.mean() == pytest.approx(expected, rel=0.16)
     ratio = np.diag(told.means) * told.noise**2 / 0.02**2
     assert ratio.mean() == pytest.approx(expected, rel=0.14)
+
+
+def test_filtered_noise_scatters_as_white_noise_of_its_independent_points():
+    """A mean over four points leaves a quarter of them independent, and neighbours of segments hardly correlate."""
+    random, nothing, n = np.random.default_rng(56), np.empty((SEGMENTS * PER_SEGMENT, 0)), SEGMENTS * PER_SEGMENT
+    windows = []
+    for _ in range(200):
+        white = random.normal(size=(n + 3, 3))
+        noise = 0.5 * (white[3:] + white[2:-1] + white[1:-2] + white[:-3])
+        windows.append(replace(window_of(REST, nothing, nothing, 0.02 * noise, SEGMENTS), independent=0.25))
+    assert np.diag(condense(windows).type_a.means).mean() == pytest.approx(1.0, rel=0.15)
 
 
 def test_few_segments_tell_few_degrees_of_freedom():

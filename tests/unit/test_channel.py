@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from agent.config.knowledge import Certificate
-from agent.core.events import Estimate
+from agent.core.events import DriftReport, Estimate
 from agent.core.identity import not_certified
 from agent.core.kept import shelved
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import pack, unpack
 from tests.building_windows import GRAVITY
 from tests.clamp_windows import S_TRUE
-from tests.unit.mounted_site import WINDOW_S, Site, begun, said, site_config, updates, windows
+from tests.unit.mounted_site import EPOCH_NS, SECOND, WINDOW_S, Site, begun, said, site_config, updates, windows
 
 OF_B = S_TRUE * 0.97
 
@@ -133,6 +133,20 @@ def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
     later = updates(again.play(3))[0]
     assert later.windows == before.windows + 1
     assert abs(later.sensitivity[1][1] - S_TRUE[1, 1]) < 2e-3
+
+
+def test_a_step_in_a_later_run_is_dated_in_utc() -> None:
+    """The estimation counts its days through all runs; here the second one begins on day 30."""
+    site = begun(site_config())
+    site.play(3)
+    again = begun(site_config(), kept=site.kept(), day=30.0, last=100)
+    again.play(2)
+    stepped_ns = EPOCH_NS + (30 * 86400 + again.t_s) * SECOND
+    again.play(4, S=S_TRUE * np.array([1.0, 1.02, 1.0]))
+    told = [(r.parameter, r.verdict) for r in again.results if isinstance(r, DriftReport)]
+    assert told == [("Syy", "stepped")]
+    [onset_ns] = [r.onset_utc_ns for r in again.results if isinstance(r, DriftReport)]
+    assert stepped_ns < onset_ns < stepped_ns + (WINDOW_S + 2) * SECOND  # the end of the first window after it
 
 
 def test_restored_in_the_midst_it_goes_on_bit_for_bit() -> None:

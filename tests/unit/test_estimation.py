@@ -92,6 +92,19 @@ def test_a_step_too_small_for_any_window_alone_is_followed() -> None:
     assert u < 0.005
 
 
+def test_u_covers_a_step_from_the_window_on_in_which_it_is_found() -> None:
+    """S is still nearly the former one then: most windows are of before."""
+    random = np.random.default_rng(2)
+    process, exact = {"sensitivity_pct": 0.0}, {"stability_pct": 0.0}
+    found, told = settled(random, process=process, certificate=exact, gate={"false_holds": 1e-9}), set[str]()
+    quiet, hour = {"level_mps2": (0.0, 0.01, 0.0)}, 10
+    while "stepped" not in told:
+        assert hour < 70
+        [judged] = hours(found, [building_window(random, S=OF_Y, **quiet)], first=hour)
+        told, hour = {v.verdict for v in judged.drift if v.parameter == "Syy"}, hour + 1
+    assert 0.02 < abs(found.in_force.sensitivity[1, 1] - OF_Y[1, 1]) < 2 * found.in_force.standard_uncertainty[4]
+
+
 def test_what_a_certificate_tells_well_is_in_force_from_the_first_window_and_follows_a_jump() -> None:
     # u below half of a certificate's is more than a reference can give: it would be "not determined yet" for ever.
     random = np.random.default_rng(3)

@@ -15,8 +15,11 @@ from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE, sums_of
 
 RATE_HZ, SECONDS = 400.0, 20.0
 TONES_HZ = (1.0, 2.5, 4.0)
+RATE_MPS3 = np.array([0.4, -0.3, 0.2])
 GRAVITY = np.array([0.5, -1.0, np.sqrt(G_MPS2**2 - 1.25)])
 D = np.array([[0.98, 0.1, 0.02], [-0.1, 0.99, 0.05], [0.01, -0.06, 1.0]])
+
+Motion = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def motion(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -28,10 +31,16 @@ def motion(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return u, du
 
 
-def record(V: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Record:
+def going(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same while it grows all the time."""
+    u, du = motion(t)
+    return u + np.outer(t - SECONDS / 2.0, RATE_MPS3), du + RATE_MPS3
+
+
+def record(V: Callable[[np.ndarray, np.ndarray], np.ndarray], of: Motion = motion) -> Record:
     """Of a window in which V is a function of time and of the motion at that time."""
     t = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
-    u, du = motion(t)
+    u, du = of(t)
     pose = Pose("p", D, GRAVITY)
     noise = 1e-7 * np.random.default_rng(1).normal(size=(len(t), 3))
     window = Window(0.0, SECONDS, pose, sums_of(u, du, V(t, u) + noise, 10), True, "", len(t), 0)
@@ -78,6 +87,13 @@ def test_it_predicts_the_slopes_and_means_of_samples(world: str) -> None:
     # (omega lag)^3 / 6 at 4 Hz and 2 ms is 2e-5 for each of three tones, which no term of the equations has.
     np.testing.assert_allclose(slopes[0] / unit, own.slopes / unit, rtol=0, atol=4e-5)
     np.testing.assert_allclose(means[0], own.means, rtol=0, atol=2e-5)
+
+
+def test_late_indications_of_a_motion_that_grows_have_the_mean_of_an_earlier_time() -> None:
+    own = record(lambda t, _: (going(t - 2e-3)[0] @ D.T + GRAVITY) @ S_TRUE.T + Q_TRUE, going)
+    windows = Windows(Stack.of([own], fixed=False), 20.0, at_hz=0.0, share=0.0, known_size=0.0)
+    means = windows.predicted(inputs(LAG=2e-3)[None])[1]
+    np.testing.assert_allclose(means[0], own.means, rtol=0, atol=2e-5)  # 2 ms of 0.2 to 0.4 m/s3 are 4e-4 and more
 
 
 def test_the_derivatives_are_those_of_the_prediction() -> None:

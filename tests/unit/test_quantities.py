@@ -9,10 +9,12 @@ import pytest
 
 from agent.calibrate.stated import options_of
 from agent.cli.calibrate import calibrate
-from agent.config.knowledge import Certificate, Knowledge, Prior, Process, Uncertainty
+from agent.config.knowledge import AT_FIXED_MOUNT, Certificate, Knowledge, Prior, Process, Setting, Uncertainty
+from agent.config.knowledge import WALKS as WALKS_STATED
 from calib.estimate.nuisances import Priors
-from calib.estimate.quantities import KINDS, PRIORS, WALKS, Statement
+from calib.estimate.quantities import KINDS, WALKS
 from calib.estimate.wander import Wander
+from calib.recorded.options import STATED as BY_OPTION
 from calib.recorded.priors import priors_of
 
 STATED = Knowledge(
@@ -75,9 +77,8 @@ def test_walks_of_a_channel() -> None:
 
 
 def test_every_number_that_the_configuration_may_state_is_tried_here() -> None:
-    at_mount = {name for name, s in PRIORS.items() if s.configuration or s.at_fixed_mount}
-    assert at_mount == {*OF_THE_CONFIGURATION, *AT_A_FIXED_MOUNT} - {"tilt_rad"}
-    assert {s.option for s in PRIORS.values() if s.option} == set(OF_THE_OPTIONS)
+    assert set(AT_FIXED_MOUNT) == {*OF_THE_CONFIGURATION, *AT_A_FIXED_MOUNT} - {"tilt_rad"}
+    assert {option for option, _ in BY_OPTION.values()} == set(OF_THE_OPTIONS)
 
 
 @pytest.mark.parametrize("option", OF_THE_OPTIONS)
@@ -113,8 +114,8 @@ def test_what_wanders_wanders_by_its_own_walk() -> None:
     assert found[9:] == pytest.approx(10.0 * np.hypot(walks.offset_mps2, 2.0 * walks.tilt_rad))
 
 
-@pytest.mark.parametrize("statement", [*PRIORS.values(), *WALKS.values()], ids=lambda s: s.name)
-def test_every_place_is_in_the_configuration(statement: Statement) -> None:
-    for place in (*statement.configuration, *statement.at_fixed_mount):
+@pytest.mark.parametrize("setting", [*AT_FIXED_MOUNT.values(), *WALKS_STATED.values()], ids=lambda s: s.fields[0])
+def test_every_setting_is_in_the_configuration(setting: Setting) -> None:
+    for place in setting.fields:
         section, field = place.split(".")
         assert isinstance(getattr(getattr(STATED, section), field), float)

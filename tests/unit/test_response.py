@@ -161,7 +161,7 @@ def test_an_unknown_corner_at_a_fifth_of_slow_motion(order: int, side: str) -> N
     corner = highpass(0.06, order)
     response: Filter = corner if side == "sensor" else lambda f: 1.0 / corner(f)
     made = pair(2, response, band_hz=(0.3, 2.0), rate_hz=20.0, seconds=300.0)
-    found = calibrated(made, corner_unknown=1.0)
+    found = calibrated(made, corner_unknown=True)
     error, u = errors(made, found)
     assert np.abs(np.diag(error)).max() < 4e-4
     assert np.abs(error / u).max() < 4.5
@@ -175,7 +175,7 @@ def test_an_unknown_corner_at_a_fifth_of_slow_motion(order: int, side: str) -> N
 def test_an_unknown_corner_beside_a_filter_near_the_motion() -> None:
     both = highpass(0.1, 2), lowpass(2, 16.0)
     made = pair(3, lambda f: both[0](f) * both[1](f))
-    error, u = errors(made, calibrated(made, corner_unknown=1.0))
+    error, u = errors(made, calibrated(made, corner_unknown=True))
     assert np.abs(np.diag(error)).max() < 1e-3
     assert np.abs(error / u).max() < 4.5
 

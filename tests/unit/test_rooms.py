@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+from agent.config.knowledge import Knowledge
 
 ROOT = Path(__file__).parents[2]
 FORBIDDEN = ("sqlite3", "zenoh", "mcap", "serial", "click")
@@ -24,6 +28,21 @@ def test_the_core_and_the_library_load_no_input_or_output() -> None:
     assert "agent.core.pipeline" in loaded
     assert "calib.paper.method3" in loaded
     assert [name for name in loaded if name.partition(".")[0] in FORBIDDEN] == []
+
+
+def test_no_text_of_the_library_names_an_option_a_command_or_a_setting_of_the_agent() -> None:
+    """Names in `...` are arguments of functions; the command line writes them as its options."""
+    settings = [rf"\b{section}\.{field}\b" for section, of in Knowledge.model_fields.items()
+                for field in of.annotation.model_fields]  # type: ignore[union-attr]  # fmt: skip
+    of_the_agent = re.compile("|".join([r"--[a-z]", "fieldcal", r"\btoml\b", r"\bagent\b", *settings]), re.IGNORECASE)
+    assert of_the_agent.search("state prior.u_corner_hz")
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}: {node.value}"
+        for path in sorted((ROOT / "calib").rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and of_the_agent.search(node.value)
+    ]
+    assert found == []
 
 
 def test_a_run_loads_nothing_while_devices_are_read() -> None:

@@ -160,7 +160,7 @@ def test_a_stated_band_is_used_from_the_first_window_on_and_can_be_stated_later(
     state.load(unpack(pack(later.snapshot())))
     loaded = state.copy()
     assert state.restate()
-    assert "the channel states this band" in state.settled_since(loaded)
+    assert "this band is stated" in state.settled_since(loaded)
     assert state.motion_to_hz == stated.motion_to_hz
     assert state.reference_frequency_hz == later.reference_frequency_hz  # it was settled
     for found in (stated, state):

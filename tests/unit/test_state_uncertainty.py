@@ -14,10 +14,11 @@ from calib.estimate.over_frequency import OverFrequency
 from calib.estimate.record import Record
 from calib.estimate.rows import Degrees, Noise, Rows
 from calib.estimate.state import State
-from calib.estimate.statements import Dated, Statements, Step
+from calib.estimate.statements import Dated, Statements, Step, Widening
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Calibration, Pose
+from calib.signal.known_response import known_of
 from tests.clamp_windows import G_MPS2
 from tests.drawn_records import UP, Truth, template, told
 
@@ -103,6 +104,16 @@ def test_chi_squared_is_that_of_what_was_stated_and_seen() -> None:
     assert found.chi2 == pytest.approx(expected, rel=1e-4)
 
 
+def test_a_window_that_is_taken_adds_to_chi_squared_what_it_is_off_its_prediction() -> None:
+    """Three axes, each with an offset of the same prior whose windows scatter: a covariance of two values."""
+    own, scatter = replace(AT_REST, pose=Pose("p", np.eye(3), np.zeros(3))), 0.05
+    found, seen = state({"offset_mps2": scatter}), np.array([0.7, -0.4])
+    for day, by in enumerate(seen):
+        found.update(told(own, Truth(S, Q + by), float(day)))
+    covariance = SCALE**2 * (scatter**2 * np.eye(2) + U_Q**2)
+    assert found.chi2 == pytest.approx(3.0 * seen @ np.linalg.solve(covariance, seen), rel=1e-4)
+
+
 @pytest.mark.parametrize("unit", [1e-9, 1e6])
 def test_the_output_unit_does_not_matter(unit: float) -> None:
     """A sensor whose output is in nV, or in counts: all that is stated of S and Q is in proportion."""
@@ -150,11 +161,27 @@ def test_a_dated_calibration_counts_once() -> None:
     np.testing.assert_allclose(now.variance[:12], 0.5 * U**2, rtol=1e-9)
 
 
+def test_half_of_the_time_of_a_widened_walk_adds_half_of_its_variance() -> None:
+    """The first window tells S, the second one, at rest, nothing of it."""
+    variances = []
+    for widened in ((), (Widening(0.0, 10.0, {"Sxx": 0.02}),)):
+        stated = Statements(
+            MEAN, U, {"": Priors.none()}, Wander(STILL), TemperatureModel(), widened=widened, held_mps2=UP
+        )
+        variances.append(estimate([record(), record(AT_REST, 5.0)], stated).now.variance[:9])
+    np.testing.assert_allclose(variances[1] - variances[0], np.append(0.5 * 0.02**2, np.zeros(8)), rtol=1e-6, atol=1e-9)
+
+
 def test_what_known_filters_leave_open_is_in_the_uncertainty_of_s() -> None:
-    """1 % of each element, common to all of them."""
-    priors = Priors.none().with_values({"known_u": 0.01, "reference_frequency_hz": 2.0})
+    """At half the corner, |h| of a first order is (1 + 1/4)^-0.5, and changes by 0.2 % for each % of the corner. The
+    data tell how much both filters attenuate together; what one of two alike has of it stays open by 1 / sqrt(2)."""
+    filters = ["lowpass order=1 corner_hz=16 u_corner_pct=0.5"]
+    priors = Priors.none().beside_known(known_of(filters, filters))
     now = estimate([record()], Statements(MEAN, U, {"": priors}, Wander(STILL), TemperatureModel())).now
-    more = OverFrequency().factor(now, "A", priors)[:12]
+    over = OverFrequency(first_hz=8.0, late_s=0.0)
+    more = over.factor(now, "A", priors)[:12]
     grown = more @ more.T - now.factor[:12] @ now.factor[:12].T
-    open_ = np.append(0.01 * S.ravel(), np.zeros(3))
-    np.testing.assert_allclose(grown, np.outer(open_, open_), rtol=1e-4, atol=1e-9)
+    open_ = np.append(0.005 * 0.2 / np.sqrt(2.0) * S.ravel(), np.zeros(3))
+    told = over.budget(now, "A", priors, np.eye(12, len(now)))["known filters"]
+    np.testing.assert_allclose(told, open_**2, rtol=2e-2)
+    np.testing.assert_allclose(grown, np.outer(open_, open_), rtol=2e-2, atol=1e-9)

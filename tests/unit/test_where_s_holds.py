@@ -143,7 +143,7 @@ def test_a_response_that_noise_makes_up_is_refused_with_a_remedy_that_works() ->
     """Terms of the response up to ten times what filters have; with none left to the data S is right."""
     _, found = weak(UNKNOWN)
     (reason,) = found.reasons
-    assert "state --sensor-filter flat --reference-filter flat" in reason
+    assert "state `sensor_filter` flat `reference_filter` flat" in reason
     made, found = weak(known_of(["flat"], ["flat"]))
     assert found.status == "valid"
     away = np.abs(found.sensitivity - made.sensitivity).ravel()
