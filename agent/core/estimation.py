@@ -245,7 +245,7 @@ class Estimation:
                 assert made is not None  # a proposal is one of the two
                 proposal = Proposal(decision.proposal, *made.beyond(self.state), made.shares)
                 self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
-            why = self.lag_watch.beyond or most_likely(innovation, self.state.scale)
+            why = self.lag_watch.beyond or most_likely(innovation, self.state.scale, self.gate.limit)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
         news = (noise_news, self._news(earlier) if decision.action in ("take", "adopt") else "", followed)
         return Judged(decision, innovation, told, "; ".join(filter(None, news)))

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from agent.config import Channel
-from agent.core.gate import Gate
+from agent.core.gate import Gate, Limit
 from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
@@ -198,11 +198,11 @@ def _settings(kind: Kind, fixed_mount: bool) -> tuple[str, ...]:
     return (kind.prior.at_fixed_mount if fixed_mount else ()) or kind.prior.configuration
 
 
-def most_likely(innovation: Innovation, scale: float) -> str:
-    """The parameter whose change alone explains a window best."""
+def most_likely(innovation: Innovation, scale: float, limit: Limit) -> str:
+    """The parameter whose change alone explains a window; `limit` is that of the gate."""
     size = np.abs(np.nan_to_num(innovation.score))
     p = int(np.argmax(size))
-    if size[p] == 0.0:
+    if innovation.statistic - size[p] ** 2 > limit(innovation.degrees_of_freedom - 1.0):
         return "no change of a single parameter explains the window"
     change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
     told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"
