@@ -14,7 +14,7 @@ from agent.config import Channel
 from agent.core.exchanges import Explained, exchanged, explanation
 from agent.core.explaining import explained, most_likely
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
-from agent.core.hypotheses import Devices, confirmed, possible_jump, rescaled, tilt_rad
+from agent.core.hypotheses import Devices, confirmed, possible_jump, rescaled, shape_of_change, tilt_rad
 from agent.core.noise_watch import NoiseWatch
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
@@ -29,7 +29,7 @@ from calib.estimate.sources import Sources
 from calib.estimate.state import State
 from calib.estimate.statements import Step
 from calib.estimate.walks import Walks
-from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums
+from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums, own_channels
 from calib.signal.response import Response
 
 DAY_S = 86400.0
@@ -212,7 +212,7 @@ class Estimation:
             still="" if self.gate.calibrated else where_nothing_moved(trial.unexcited),
         )  # fmt: skip
         decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
-        earlier = self.state
+        earlier, followed = self.state, ""
         if decision.action == "take":
             self.state = trial
         elif decision.action == "adopt":
@@ -221,7 +221,8 @@ class Estimation:
             whole = self.state.solve()
             self.drift.restart(innovation.information > 0.0)
             self.walks.restart()
-            decision = replace(decision, reason=f"{decision.reason}{who}")
+            shape = "" if at_once else self._shape(held[0].day, record)
+            decision = replace(decision, reason="; ".join(filter(None, (f"{decision.reason}{who}", shape))))
         kept = held if decision.action == "hold" else self._held
         self._held = kept[-self.gate.held :] if self.gate.held else []
         if self._held and (at_once or self._explain_s is None):
@@ -234,7 +235,7 @@ class Estimation:
             found = self.drift.update(day * DAY_S, innovation.score, innovation.information)
             told += [v for v in found if v.verdict != "stable" or v.parameter not in self.walks.drifting]
             if not self.gate.held:  # else it is for windows that agree to confirm it
-                self._follow()
+                followed = self._follow(record)
         if decision.in_force:
             self.residual_sd = self.state.residual_sd
             self._update_in_force(whole, record if decision.action == "take" else None)
@@ -244,9 +245,9 @@ class Estimation:
                 assert made is not None  # a proposal is one of the two
                 proposal = Proposal(decision.proposal, *made.beyond(self.state), made.shares)
                 self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
-            why = self.lag_watch.beyond or most_likely(innovation, self.state.scale)
+            why = self.lag_watch.beyond or most_likely(innovation, self.state.scale, self.gate.limit)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
-        news = (noise_news, self._news(earlier) if decision.action in ("take", "adopt") else "")
+        news = (noise_news, self._news(earlier) if decision.action in ("take", "adopt") else "", followed)
         return Judged(decision, innovation, told, "; ".join(filter(None, news)))
 
     def _confirmed(self, held: Sequence[Record]) -> tuple[State | None, str, bool]:
@@ -423,8 +424,15 @@ class Estimation:
                 self.budget = found
         return True
 
-    def _follow(self) -> None:
-        """Steps so small that each window alone was consistent, and drifts: the state may follow them.
+    def _shape(self, day: float, newest: Record) -> str:
+        """What the change of S since the windows of a day looks like. With two references windows of both tell which
+        device has changed, and none is named by one of them."""
+        count = own_channels(newest.channels) if len(self._beside) == 1 else 0
+        return shape_of_change(self.state, day, newest.pose.direction[:, :count], self.gate.limit)
+
+    def _follow(self, newest: Record) -> str:
+        """Steps so small that each window alone was consistent, and drifts: the state may follow them. Returns what the
+        change of S looks like, "" where nothing is followed or nothing can be said.
 
         A drift has made S or Q wrong since its onset. U covers this, and the rate becomes unknown. What looks like a
         change of S may be another filter, so that the response over frequency is found anew with S, or one of the
@@ -437,11 +445,16 @@ class Estimation:
             if verdict.verdict == "drifting":
                 rate[k] = np.hypot(verdict.rate, verdict.u_rate)
             loose[k] = np.hypot(verdict.change, verdict.u_change)
+        shape = ""
+        if loose[:9].any():
+            since_s = min(own.onset_s for own, size in zip(self.drift.result(), loose[:9], strict=False) if size)
+            shape = self._shape(since_s / DAY_S, newest)
         if loose.any():
             leaning_rad, another_filter = tilt_rad(loose[9:], self.state.scale), bool(loose[:9].any())
             u = self.state.changes(loose, leaning_rad, u_rate=rate, another_filter=another_filter)
             self.state.step(u | self._of_reference(loose))
             self.drift.restart(loose > 0.0)
+        return shape
 
     def _of_reference(self, loose: Array) -> dict[str, float]:
         """By how much the reference in use may have changed in place of S, by key; nothing if it is stated not to."""

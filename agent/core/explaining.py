@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from agent.config import Channel
 from agent.config.knowledge import AT_FIXED_MOUNT, PRIORS, Setting
-from agent.core.gate import Gate
+from agent.core.gate import Gate, Limit
 from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
@@ -198,11 +198,11 @@ def _setting(kind: Kind, fixed_mount: bool) -> Setting | None:
     return None if kind.prior is None else (AT_FIXED_MOUNT if fixed_mount else PRIORS).get(kind.prior.name)
 
 
-def most_likely(innovation: Innovation, scale: float) -> str:
-    """The parameter whose change alone explains a window best."""
+def most_likely(innovation: Innovation, scale: float, limit: Limit) -> str:
+    """The parameter whose change alone explains a window; `limit` is that of the gate."""
     size = np.abs(np.nan_to_num(innovation.score))
     p = int(np.argmax(size))
-    if size[p] == 0.0:
+    if innovation.statistic - size[p] ** 2 > limit(innovation.degrees_of_freedom - 1.0):
         return "no change of a single parameter explains the window"
     change = innovation.score[p] / np.sqrt(innovation.information[p]) / scale
     told = f"{change:+.3g} m/s2" if p >= 9 else f"{100.0 * change:+.3g} %"

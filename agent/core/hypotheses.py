@@ -8,7 +8,7 @@ state follows the step, with u(S) larger by what the reference may have done, un
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from agent.core.gate import Limit
 from calib.estimate.quantities import REFERENCE, REFERENCE_DRIFT, Quantity
 from calib.estimate.record import Record
 from calib.estimate.state import State
-from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.geometry import AXES, STANDARD_GRAVITY_MPS2
 from calib.model import Array, Calibration, own_channels
 
 # A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
@@ -89,6 +89,61 @@ def rescaled(state: State, held: Sequence[Record], factor: float, limit: Limit) 
     wider = max(1.0, WIDER * abs(factor - 1.0) / JUMP_SENSITIVITY)
     tried = _tried(state, held, _of_sensor(state, held, wider=wider), limit, state.chi2_beside(held))
     return tried.state if tried.fits else None
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What a change of S may look like: chi-squared of what is left of the change, its unknowns, and the words."""
+
+    chi2: float
+    unknowns: int
+    words: str
+
+    @property
+    def score(self) -> float:
+        """For comparison: the lowest is the best."""
+        return self.chi2 + AN_UNKNOWN * self.unknowns
+
+
+def shape_of_change(state: State, day: float, directions: Array, limit: Limit) -> str:
+    """What the change of S since the windows of a day looks like, for the operator: a turn, another scale of an output,
+    of all, or of a channel of the reference, with `directions` (3, C) in the sensor's frame. "" where it is none of
+    these, or where nothing has changed.
+
+    The change follows from all windows, as if S and Q had stepped before this day.
+    """
+    size = np.append(np.full(9, JUMP_SENSITIVITY), np.full(3, JUMP_OFFSET_MPS2)) * state.scale
+    moved, covariance = state.change_on(day, state.changes(size))
+    white = np.linalg.inv(np.linalg.cholesky(covariance[:9, :9]))
+    found = sorted(_shapes(moved[:9], white, state.result().sensitivity, directions), key=lambda shape: shape.score)
+    best, none = found[0], Shape(float(np.sum((white @ moved[:9]) ** 2)), 0, "")
+    if best.score > none.score - DECISIVE or best.chi2 > limit(9.0 - best.unknowns):
+        return ""
+    alike = [shape.words for shape in found if shape.score <= best.score + DECISIVE]
+    return f"S has changed as by {' or '.join(alike)} (chi-squared {best.chi2:.0f}, {none.chi2:.0f} without a change)"
+
+
+def _shapes(moved: Array, white: Array, S: Array, directions: Array) -> Iterator[Shape]:
+    """Each shape with its sizes by least squares; `white` (9, 9) makes the covariance of `moved` (9,) one."""
+
+    def fitted(*changes: Array) -> tuple[float, Array]:
+        by = white @ np.array([change.ravel() for change in changes]).T
+        sizes = np.linalg.lstsq(by, white @ moved, rcond=None)[0]
+        return float(np.sum((white @ moved - by @ sizes) ** 2)), sizes
+
+    # A sensor that is turned feels all turned the other way.
+    chi2, turn = fitted(*(S @ np.cross(way, np.eye(3)) for way in np.eye(3)))
+    angle = max(float(np.linalg.norm(turn)), np.finfo(float).tiny)
+    axis = ", ".join(f"{x:.2f}" for x in turn / angle)
+    yield Shape(chi2, 3, f"a turn of the sensor against its reference by {np.rad2deg(angle):.2g} deg about ({axis})")
+    for axis, row in zip(AXES, np.eye(3), strict=True):
+        chi2, (size,) = fitted(row[:, None] * S)
+        yield Shape(chi2, 1, f"{100.0 * size:+.2g} % in output {axis} of the sensor")
+    chi2, (size,) = fitted(S)
+    yield Shape(chi2, 1, f"{100.0 * size:+.2g} % in all outputs")
+    for axis, way in zip(AXES, directions.T, strict=False):
+        chi2, (size,) = fitted(np.outer(S @ way, way))
+        yield Shape(chi2, 1, f"{-100.0 * size:+.2g} % in channel {axis} of the reference")
 
 
 def _of_sensor(state: State, held: Sequence[Record], leaning_rad: float = 0.0, wider: float = 1.0) -> dict[str, float]:

@@ -18,6 +18,7 @@ from agent.config import Config
 from benchmarks.online.config import building_config
 from benchmarks.online.life import MAIN, House
 from benchmarks.online.node import adxl355
+from calib.geometry import AXES
 from calib.model import Array
 from hw.virtual.building import DAY_S, Building, BuildingParameters, BuildingTruth, Instrument, Weather
 from hw.virtual.building_motion import BuildingMotion, ComplexArray
@@ -49,6 +50,13 @@ BENT_MPS2, SPAN_M = 0.012, 40.0  # force over mass while the axle is on the span
 WINDY = np.array([1.0, 0.6, 0.5, 0.35, 0.25, 0.05, 0.02])  # the part of the wind's level in each mode
 LAG_OF_BODY_S = 3000.0  # by which S follows the thermometer
 EVENTS = {"shock": 8, "turn": 13, "shift": 18, "swap": 23}  # day on which they happen, at noon
+NAMES = {  # what is said of an event by name; the shock changes the output along one axis
+    "shock": "% in output {axis} of the sensor",
+    "turn": "a turn of the sensor",
+    "shift": "the time between sensor and reference has shifted",
+    "swap": "the reference is another device now",
+}
+SETTLED = 12  # windows after an event was told
 LOST = (5.2, 5.6)  # days between which the reference is lost
 SHOCK, TURN_DEG, SHIFT_S = 0.005, 0.3, 0.012
 REFERENCES = ("DC", "AC")
@@ -239,46 +247,84 @@ def _reads(random: np.random.Generator) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Hour:
+    """After one window: the status, what was said since the window before, S and Q in force (12,) with u, which of them
+    are determined, and the true values."""
+
+    status: str
+    said: Sequence[str]
+    value: Array
+    u: Array
+    determined: Array
+    truth: Array
+
+    @property
+    def worst(self) -> float:
+        """The largest error of a determined element over its u."""
+        return float(np.max(np.abs(self.value - self.truth) / self.u, where=self.determined, initial=0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Month:
-    """One run: the shares of windows after which the status was `valid` or `held`; in how many windows `beyond` 3 u and
-    4 u the worst element of S and Q in force was while VALID; u of the main sensitivities (3,) before the first event
-    and in the end, relative; the first HELD after each event: after how many windows, and what was said."""
+    """One run. `valid`, `held`: the shares of windows after which the status was so. `beyond`: in how many windows the
+    worst element in force was beyond 3 u and 4 u while VALID; `unseen`: how many of the latter were between an event
+    and the window that told it. `u_pct` of the main sensitivities before the first event and in the end, relative.
+
+    Of each event that was `told` by name: after how many windows, the largest error of the change of S after twelve
+    more windows, over u of S in force then, and what was said.
+    """
 
     job: Job
     valid: float
     held: float
     beyond: tuple[int, int]
+    unseen: int
     u_pct: tuple[float, float]
-    said: dict[str, tuple[int, str]]
+    told: dict[str, tuple[int, float, str]]
 
 
 def one(job: Job) -> Month:
     """Simulate a month."""
     reference, seed = job
     own = world(seed, reference)
-    house, statuses, worst, u_pct = House(own.bridge, own.config), list[str](), list[float](), list[float]()
-    gateway, said = house.gateway, dict[str, tuple[int, str]]()
+    house, hours = House(own.bridge, own.config), list[Hour]()
+    gateway = house.gateway
     for visit in range(DAYS * HOURS_A_DAY):
+        before = len(gateway.reasons)
         if visit == at_visit("swap"):
             house.fit(own.later, "B")
             house.plug()
-        before = len(gateway.reasons)
         house.visit()
-        statuses.append(gateway.status)
-        if (update := gateway.in_force) is not None:
-            u = np.array(update.standard_uncertainty)
-            truth = own.truth(own.bridge.span(visit)[1], update.reference_frequency_hz)
-            over_u = np.abs(np.append(np.ravel(update.sensitivity), update.offset) - truth) / u
-            worst.append(float(np.max(over_u, where=np.array(update.determined), initial=0.0)))
-            u_pct.append(float(100.0 * (u[MAIN] / np.abs(np.diag(update.sensitivity))).max()))
-        for event in EVENTS:
-            since = visit - at_visit(event)
-            if event not in said and 0 <= since < HOURS_A_DAY and gateway.status == "HELD":
-                said[event] = since + 1, next((r for r in gateway.reasons[before:] if "contradict" in r), "")
-    beyond = tuple(sum(w > most and s == "VALID" for w, s in zip(worst, statuses, strict=False)) for most in (3.0, 4.0))
-    share = {name: statuses.count(name) / len(statuses) for name in ("VALID", "HELD")}
-    ends = u_pct[at_visit("shock") - 1], u_pct[-1]
-    return Month(job, share["VALID"], share["HELD"], (beyond[0], beyond[1]), ends, said)
+        update = gateway.in_force
+        assert update is not None  # the first window is taken
+        truth = own.truth(own.bridge.span(visit)[1], update.reference_frequency_hz)
+        value, determined = np.append(np.ravel(update.sensitivity), update.offset), np.array(update.determined)
+        u = np.array(update.standard_uncertainty)
+        hours.append(Hour(gateway.status, gateway.reasons[before:], value, u, determined, truth))
+    return month(job, hours)
+
+
+def month(job: Job, hours: Sequence[Hour]) -> Month:
+    """What a run shows."""
+    told, unseen = dict[str, tuple[int, float, str]](), 0
+    for event in EVENTS:
+        first = at_visit(event)
+        before = hours[first - 1]
+        if event == "shock":
+            axis = AXES[int(np.argmax(np.abs((hours[first].truth - before.truth)[MAIN])))]
+        name = NAMES[event].format(axis=axis)
+        found = ((k, text) for k in range(first, first + HOURS_A_DAY) for text in hours[k].said if name in text)
+        k, text = next(found, (first + HOURS_A_DAY, ""))
+        unseen += sum(hour.status == "VALID" and hour.worst > 4.0 for hour in hours[first:k])
+        if text:
+            later = hours[k + SETTLED]
+            error = (later.value - before.value) - (later.truth - before.truth)
+            told[event] = k - first + 1, float(np.max(np.abs(error / later.u)[:9])), text
+    beyond = [sum(hour.worst > most and hour.status == "VALID" for hour in hours) for most in (3.0, 4.0)]
+    share = {name: sum(hour.status == name for hour in hours) / len(hours) for name in ("VALID", "HELD")}
+    ends = [hours[k].u[MAIN] / np.abs(hours[k].value[MAIN]) for k in (at_visit("shock") - 1, -1)]
+    u_pct = 100.0 * float(ends[0].max()), 100.0 * float(ends[1].max())
+    return Month(job, share["VALID"], share["HELD"], (beyond[0], beyond[1]), unseen, u_pct, told)
 
 
 def at_visit(event: str) -> int:
@@ -294,19 +340,23 @@ def jobs(runs: int) -> list[Job]:
 def table(found: Sequence[Month]) -> str:
     """One row for each run, and what was said of its events."""
     lines = [
-        "| reference, seed | VALID, % of windows | HELD, % | VALID beyond 3 u, 4 u | u of main S, %: day 8, end | "
-        + " | ".join(f"{event}: HELD after" for event in EVENTS) + " |",
-        "| --- |" + " --- |" * (4 + len(EVENTS)),
-    ]  # fmt: skip
+        "| reference, seed | VALID, % of windows | HELD, % | VALID beyond 3 u, 4 u | of these before an event was told "
+        "| u of main S, %: day 8, end | " + " | ".join(f"{event}: told after, error" for event in EVENTS) + " |",
+        "| --- |" + " --- |" * (5 + len(EVENTS)),
+    ]
     for run in found:
-        after = [f"{run.said[event][0]} windows" if event in run.said else "not held" for event in EVENTS]
+        told = [
+            f"{run.told[event][0]} windows, {run.told[event][1]:.1f} u" if event in run.told else "not told"
+            for event in EVENTS
+        ]
+        three, four = run.beyond
         lines.append(
-            f"| {run.job[0]}, {run.job[1] - SEED} | {100.0 * run.valid:.1f} | {100.0 * run.held:.1f} | "
-            f"{run.beyond[0]}, {run.beyond[1]} | {run.u_pct[0]:.3f}, {run.u_pct[1]:.3f} | {' | '.join(after)} |"
+            f"| {run.job[0]}, {run.job[1] - SEED} | {100.0 * run.valid:.1f} | {100.0 * run.held:.1f} | {three}, {four} "
+            f"| {run.unseen} | {run.u_pct[0]:.3f}, {run.u_pct[1]:.3f} | {' | '.join(told)} |"
         )
     said = [
         f"- {run.job[0]}, {run.job[1] - SEED}, {event}: {text}"
         for run in found
-        for event, (_, text) in run.said.items()
+        for event, (_, _, text) in run.told.items()
     ]
     return "\n".join([*lines, "", *said])

@@ -101,6 +101,13 @@ def condense(
     )
 
 
+def regressed(root: Array, slopes: Array) -> Array:
+    """b (..., 2M, 3) from R (..., 2M, 2M) and R b. A channel that those before it make up has no part of b: the
+    derivative of an integral is a channel itself, and would have half of S by the least norm."""
+    live = np.diagonal(root, axis1=-2, axis2=-1) ** 2 > PIVOT_FLOOR * np.sum(root**2, axis=-2)
+    return np.asarray(np.linalg.pinv(root * live[..., None, :], rcond=1e-9) @ slopes)
+
+
 def mean_frequency_hz(data: Condensed) -> float:
     """The mean frequency of the motion, by power; 0 where nothing moves, or where the response is no unknown."""
     real = range(own_channels(data.channels))

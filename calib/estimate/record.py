@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.estimate.condense import condense, mean_frequency_hz
+from calib.estimate.condense import condense, mean_frequency_hz, regressed
 from calib.estimate.deviations import Deviations, LeftOpen
 from calib.estimate.never_turned import mean_input
 from calib.excitation.bands import ABOVE, HIGHEST, motion_band_hz, parts, share_above
@@ -212,7 +212,7 @@ class Record:
     def loadings(self) -> Array:
         """(2, 6M) derivatives of the slopes, whitened by the noise, by a lag of this window alone and by their size."""
         m = self.channels
-        b = np.linalg.pinv(self.root, rcond=1e-9) @ self.slopes
+        b = regressed(self.root, self.slopes)
         size = np.zeros_like(self.slopes)
         size[:m] = self.slopes[:m]
         return np.array([(-self.root[:, m:] @ b[:m] / self.noise).ravel(), (size / self.noise).ravel()])

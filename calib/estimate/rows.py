@@ -10,6 +10,7 @@ from itertools import accumulate
 import numpy as np
 
 from calib.estimate import physics
+from calib.estimate.condense import regressed
 from calib.estimate.physics import Stack, Windows
 from calib.estimate.quantities import (
     REFERENCE_DRIFT,
@@ -280,7 +281,7 @@ class _Slopes:
 def _by_channel(windows: Windows) -> Array:
     """(W, 2M, 3, C) derivatives of the slopes, whitened by the noise, by the size of each channel of the reference."""
     own, m = windows.stack, windows.channels
-    b = (np.linalg.pinv(own.root, rcond=1e-9) @ own.slopes)[:, :m] / own.noise[:, None]
+    b = regressed(own.root, own.slopes)[:, :m] / own.noise[:, None]
     channels = np.resize(np.eye(own_channels(m)), (m, own_channels(m)))  # integrals have the size of their own channel
     return np.asarray(np.einsum("wrm,mc,wmi->wric", own.root[..., :m], channels, b))
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.distributions import chi2_quantile
-from calib.estimate.condense import Condensed
+from calib.estimate.condense import Condensed, regressed
 from calib.model import Array
 
 PROBABILITY = 0.99  # confidence of the test for scatter: noise alone passes it once in a hundred recordings
@@ -42,7 +42,7 @@ class SlopeScatter:
     def of(data: Condensed, lag_s: ArrayLike = 0.0, attenuation: ArrayLike = 0.0) -> SlopeScatter:
         """The scatter of condensed windows; `lag_s` and `attenuation` are (B,), or one number for all windows."""
         m, blocks = data.channels, len(data.slopes)
-        own = np.linalg.pinv(data.root, rcond=1e-9) @ data.slopes  # zero rows of an unexcited channel stay zero
+        own = regressed(data.root, data.slopes)
         lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / data.type_a.noise[:, None]
         signal = np.zeros_like(data.slopes)
         signal[:, :m] = data.slopes[:, :m] / data.type_a.noise[:, None]

@@ -506,6 +506,17 @@ class State:
         trial.take_also(records, [Step(float(np.nextafter(records[0].day, -np.inf)), dict(u))])
         return trial
 
+    def change_on(self, day: float, u: Jump) -> tuple[Array, Array]:
+        """By how much S and Q changed (12,), and the covariance (12, 12), if unknowns stepped just before the windows
+        of a day (see `changes`), and not since then. No change where no window is older."""
+        begin, trial = float(np.nextafter(day, -np.inf)), self.copy()
+        others = [step for step in self._steps if step.day < begin or not step.u.keys() & u.keys()]
+        trial._steps = sorted([*others, Step(begin, dict(u))], key=lambda step: step.day)
+        for then in trial.estimate().past():
+            if then.now.day < begin:
+                return then.moved[:12], np.asarray(then.moved_factor[:12] @ then.moved_factor[:12].T)
+        return np.zeros(12), np.eye(12)
+
     def copy(self) -> Self:
         """An independent copy, to try windows on."""
         other = object.__new__(type(self))

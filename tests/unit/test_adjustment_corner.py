@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.condense import condense
 from calib.estimate.nuisances import Applied, Priors
-from calib.model import Pose
+from calib.estimate.record import Record
+from calib.estimate.slope_scatter import SlopeScatter
+from calib.model import Pose, Window
 from calib.signal.corner import integral, with_integral, without_corner
 from tests.clamp_windows import ALPHAS_DEG, G_MPS2, S_TRUE, TRUTH, frame, window_of
 
@@ -74,3 +77,25 @@ def test_the_corner_is_found_in_total_whatever_was_taken_out(taken_hz):
     assert _corner(found) == pytest.approx(CORNER_HZ, abs=0.003)
     assert abs(next(n.value for n in found.nuisances if n.name == "lag")) < 2e-4
     np.testing.assert_allclose(found.mean[:9], TRUTH[:9], rtol=0, atol=2e-3)
+
+
+def _late(lag_s: float) -> Window:
+    """A sensor that is late beside a reference with its integrals, whose derivatives are the channels themselves."""
+    t, random = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ, np.random.default_rng(1)
+    omega = 2.0 * np.pi * np.linspace(0.5, 6.1, 12)
+    waves, amplitude = np.exp(1j * np.outer(t, omega)), np.exp(2j * np.pi * random.random((12, 3)))
+    u, du, total = ((waves @ (amplitude * by[:, None])).real for by in (np.ones(12), 1j * omega, -1j / omega))
+    felt = (waves @ (amplitude * np.exp(-1j * omega * lag_s)[:, None])).real
+    V = felt @ S_TRUE.T + 0.02 * random.normal(size=u.shape)
+    pose = with_integral(Pose("beside", np.eye(3), np.zeros(3)))
+    return window_of(pose, np.hstack([u, total]), np.hstack([du, u]), V, 18)
+
+
+def test_a_lag_moves_the_slopes_beside_integrals_as_its_scatter_counts_it():
+    lag_s = 1e-5  # its second order is 4e-4 of the first one
+    (before, after), condensed = (Record.of(_late(s), 0.0) for s in (0.0, lag_s)), condense([_late(0.0)])
+    found = before.loadings[0] * lag_s * np.tile(before.noise, 12)
+    moved = (after.slopes - before.slopes).ravel()
+    np.testing.assert_allclose(found, moved, rtol=0, atol=2e-3 * np.abs(moved).max())
+    by_files = SlopeScatter.of(condensed).lag[0] * lag_s * np.tile(condensed.type_a.noise[0], 12)
+    np.testing.assert_allclose(by_files, found, rtol=0, atol=2e-3 * np.abs(moved).max())

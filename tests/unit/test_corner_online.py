@@ -118,7 +118,7 @@ def test_a_coupling_whose_corner_the_driver_does_not_know_is_in_u(corner_hz: flo
     recording = Recording(2, devices, bench=False)
     found = in_force(recording.through_agent(**WIDE))
     error = np.diag(np.reshape(found.sensitivity, (3, 3))) - np.diag(recording.S)
-    assert (np.abs(error) < 2.0 * np.sqrt(np.diag(found.covariance)[[0, 4, 8]])).all()
+    assert (np.abs(error) < 3.0 * np.sqrt(np.diag(found.covariance)[[0, 4, 8]])).all()  # one of 40 sound runs has more
     assert (np.abs(error) < 0.003).all()
 
 

@@ -10,8 +10,10 @@ import pytest
 
 from agent.config import Config
 from agent.core.events import Result, StatusChange
+from agent.core.explaining import most_likely
 from benchmarks.online.node import Stated, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
+from calib.estimate.innovation import Innovation
 from hw.virtual.harm import Filtered, Harm, KnockedOff, Transformed, Visit
 from hw.virtual.schedule import rotation
 from tests.pair import Filter, lowpass, resonance
@@ -84,3 +86,11 @@ def test_another_filter_is_named_with_its_frequency(response: Filter, change: st
 def test_nothing_is_explained_where_nothing_is_held() -> None:
     said = [s for s in statuses(Harm()) if "windows have this band in common" not in s.reason]
     assert [s.status for s in said] == ["UNCALIBRATED", "VALID"]
+
+
+@pytest.mark.parametrize(("score", "named"), [(6.4, True), (2.3, False)])
+def test_a_window_names_a_parameter_only_where_its_change_makes_the_window_fit(score: float, named: bool) -> None:
+    """Chi-squared of 67 with 26 degrees of freedom; with 25, one window of 10,000 has more than 60."""
+    scores = np.where(np.arange(12) == 4, score, 0.5)
+    told = most_likely(Innovation(67.0, 26, scores, np.full(12, 1e4)), 1.0, {25.0: 60.1}.__getitem__)
+    assert told.startswith("a change of Syy by +6.4 %" if named else "no change of a single parameter")
