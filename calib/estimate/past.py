@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.estimate.correction import Law
+from calib.estimate.dating import Date
 from calib.model import Array
 from calib.signal.order_statistics import distinct
 
@@ -28,6 +29,7 @@ class Change:
     stated: Mapping[str, float]
     found: Array
     standard_uncertainty: Array
+    date: Date
 
 
 @dataclass(frozen=True, slots=True, eq=False)

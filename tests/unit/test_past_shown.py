@@ -19,11 +19,12 @@ from agent.core.snapshot import pack, unpack
 from agent.delivery.history import FILE_NAME, History
 from agent.delivery.schema import write_memory
 from agent.delivery.store import Store
-from agent.export.smoothing import Smoothed
+from agent.export.smoothing import Smoothed, date_of
 from agent.report.material import gather
 from calib.estimate.correction import Law
 from calib.estimate.past import Past
 from calib.model import PARAMETERS
+from calib.rounding import rounded
 from tests.unit.recorded_bench import EPOCH_NS, record
 
 RECORDING = "fieldcal-000001.mcap"
@@ -88,6 +89,58 @@ def test_table_csv_and_json_say_the_same(kept: Path, tmp_path: Path, capsys: pyt
     assert numbers == [None, None, None, third["sequence"]]
     stops = [EPOCH_NS + 1e9 * window["stop_s"] for window in reversed(results["windows"])]
     np.testing.assert_allclose([epoch["t_utc_ns"] for epoch in past["epochs"]], stops, rtol=0, atol=1e6)
+
+
+def test_recordings_tell_the_same_past_as_the_data_directory(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, "show", "--past", kept / RECORDING, "--json", "-")
+    assert (status, err) == (0, "")
+    told = json.loads(out)
+    assert told["recordings"] == [str(kept / RECORDING)]
+    assert told["past"] == [shown(capsys, kept)]
+    (tmp_path / "no.mcap").write_bytes(b"x" * 100)
+    for arguments, words in (
+        ([kept / RECORDING], "recordings tell the past; add --past"),
+        (["--past", kept / RECORDING, "--data-dir", kept], "--data-dir belongs to a data directory; remove it"),
+        (["--past", tmp_path / "no.mcap"], "damaged at byte 0"),
+        (["--past", tmp_path / "none.mcap"], "No such file"),
+    ):
+        status, out, err = run(capsys, "show", *arguments)
+        assert (status, out) == (2, "")
+        assert words in err
+
+
+def test_the_date_of_a_change_is_the_same_in_table_csv_and_json(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A step is stated between the second and the third window, whose ends are 12 s apart."""
+
+    def stepped(state: bytes) -> bytes:
+        held = unpack(state)
+        own = held["estimation"]["state"]
+        day = float(np.nextafter(own["records"][2]["day"], -np.inf))
+        own["steps"].append({"day": day, "u": {"Sxx": 2000.0}})
+        return pack(held)
+
+    change_memory(copied, stepped)
+    past, to = shown(capsys, copied), tmp_path / "past.csv"
+    (change,) = past["changes"]
+    date = change["date"]
+    first, last = date["interval_utc_ns"]
+    assert past["epochs"][0]["t_utc_ns"] <= first < date["t_utc_ns"] < last <= past["epochs"][-1]["t_utc_ns"]
+    assert (date["probability"], date["told_by"]) == (0.95, "windows")
+    assert run(capsys, "show", "--past", "--data-dir", copied, "--csv", to)[0] == 0
+    head, *rows = csv.reader(line for line in to.read_text().splitlines() if not line.startswith("#"))
+    dated = [dict(zip(head, row, strict=True)) for row in rows if row[head.index("change")]]
+    (row,) = dated
+    times = [date_of(t) for t in (date["t_utc_ns"], first, last)]
+    assert [row[name] for name in ("change", "change_after", "change_before")] == times
+    assert float(row["u_change_days"]) == date["standard_uncertainty_days"]
+    assert row["time"] == date_of(change["t_utc_ns"])
+    line = run(capsys, "show", "--past", "--data-dir", copied)[1].splitlines()[-1]
+    u = rounded(date["standard_uncertainty_days"])
+    assert line.endswith(f"; it came {times[0]} with u = {u} d, from {times[1]} to {times[2]} (95 %)")
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
