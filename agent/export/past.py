@@ -122,6 +122,7 @@ def _whole(one: SensorPast) -> dict[str, Any]:
         "windows": known.windows,
         "last_window_utc_ns": known.last_window_utc_ns,
         "output_unit": known.unit,
+        "reference_frequency_hz": known.reference_frequency_hz,
         "coverage_factor": past.coverage_factor,
         "epochs": [
             {

@@ -24,6 +24,7 @@ from typing import Self
 import numpy as np
 
 from calib.estimate.chain import Passage
+from calib.estimate.determined import Flags
 from calib.estimate.estimate import Estimate, Then
 from calib.estimate.quantities import ALL_RATES
 from calib.estimate.record import Record
@@ -78,11 +79,11 @@ def found_date(whole: Estimate, then: Then, day: float, begin: float, end: float
     probability = _probability(cost, edges)
     for _ in range(ROUNDS):
         likely = np.asarray(probability > NEGLIGIBLE * probability.sum())
-        likely[1:], likely[:-1] = likely[1:] | likely[:-1], likely[:-1] | likely[1:]  # its neighbours, too
-        parts = int(np.ceil(FINE / likely.sum()))
+        near = likely | np.append(False, likely[:-1]) | np.append(likely[1:], False)
+        parts = int(np.ceil(FINE / near.sum()))
         split = [
             np.linspace(before, after, parts + 1)[:-1] if alike else [before]
-            for before, after, alike in zip(edges[:-1], edges[1:], likely, strict=True)
+            for before, after, alike in zip(edges[:-1], edges[1:], near, strict=True)
         ]
         edges = np.append(np.concatenate(split), edges[-1])
         probability = _probability(cost, edges)
@@ -93,7 +94,7 @@ def _even_in_merged(records: Sequence[Record], edges: Array, probability: Array)
     """The same, even within each stretch over which windows were merged: when they were within it nobody knows."""
     first, last = (np.array([r.days[k] for r in records]) for k in (0, 1))
     middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
-    within = ((first < middle[:, None]) & (middle[:, None] < last)).any(axis=1)
+    within: Flags = np.asarray(((first < middle[:, None]) & (middle[:, None] < last)).any(axis=1))
     stretch = np.cumsum(np.append(True, within[1:] != within[:-1]))
     found = probability.copy()
     for k in distinct(stretch[within]).tolist():

@@ -147,7 +147,7 @@ def test_a_step_within_merged_windows_is_dated_to_them_and_no_closer() -> None:
 
 
 def test_the_date_of_a_found_drift_is_its_onset() -> None:
-    """A drift by 0.3 % a day, found when it has made 2 %. A window tells S to 0.13 %, and so the onset to half a day."""
+    """A drift by 0.3 % a day, found when it has made 2 %. A window tells S to 0.13 %, so the onset to half a day."""
     days, day = np.arange(0.0, 30.0, 0.5), 12.2
     wander, priors = Wander(dict(STILL.values) | {"sensitivity": 1e-6}), Priors(offset_mps2=1e-3)
     state, window = State(LEVEL, U, priors, wander, TemperatureModel(), fixed=True), template(PLACE, noise=0.05)

@@ -178,12 +178,52 @@ def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     assert set(columns["calibration"].tolist()) == {0, *found.values()}
 
 
+def test_stationxml_has_the_channels_of_the_miniseed_of_the_same_recording(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """ObsPy takes the sensitivity of each trace from the StationXML; the same numbers as in the past."""
+    obspy = pytest.importorskip("obspy", reason="ObsPy is not installed (extra seismic)")
+    from obspy.io.stationxml.core import validate_stationxml
+
+    place = ["--place", "47.5", "-8.25", "412"]
+
+    def export(name: str, *more: str | Path) -> tuple[int, str, str]:
+        return run(capsys, "export", kept / RECORDING, "-o", tmp_path / name, *more)
+
+    assert export("a.mseed")[0] == 0
+    for name, more in (("a.xml", []), ("b.xml", []), ("c.xml", ["--data-dir", kept])):
+        assert export(name, "--corrected", *place, *more)[::2] == (0, "")
+    first, again, by_store = ((tmp_path / f"{name}.xml").read_bytes() for name in "abc")
+    assert first == again == by_store
+    assert validate_stationxml(str(tmp_path / "a.xml")) == (True, ())
+    past, inventory = shown(capsys, kept), obspy.read_inventory(tmp_path / "a.xml")
+    traces = obspy.read(tmp_path / "a.mseed").select(location="00")
+    traces.trim(obspy.UTCDateTime(ns=past["epochs"][-1]["t_utc_ns"]))
+    assert len(traces) == 3
+    for trace in traces:
+        told = inventory.get_response(trace.id, trace.stats.starttime).instrument_sensitivity
+        k = int(trace.stats.channel[-1]) - 1
+        assert told.value == past["epochs"][-1]["sensitivity"][k][k]
+        assert told.frequency == past["reference_frequency_hz"]
+    for name, arguments, words in (
+        ("no.xml", ["--corrected"], "StationXML wants the place of the sensor; add --place"),
+        ("no.xml", place, "StationXML has the epochs of the past; add --corrected"),
+        ("no.xml", ["--corrected", "--place", "91", "0", "0"], "91.0 is not in the range"),
+        ("no.xml", ["--corrected", "--place", "nan", "0", "0"], "is not a finite number"),
+        ("no.csv", place, "--place belongs to StationXML"),
+    ):
+        status, _, err = export(name, *arguments)
+        assert status == 2
+        assert words in err
+        assert not (tmp_path / name).exists()
+
+
 def test_samples_between_two_epochs_are_corrected_by_what_is_between_their_values() -> None:
     """S grows by 2 % and Q by 1 m/s2 in a day; S and Q depend on the temperature as well."""
     sides = ((1.0, 0.0), (1.02, 1.0))
     laws = [Law(np.append(size * np.eye(3).ravel(), [Q] * 3 + [0.1] * 3), np.eye(15), 1) for size, Q in sides]
     past = Past(np.array([5.0, 6.0]), laws, (1, 1), (), 5.0, 2.0)
-    known = KnownPast("mems", "mems A", "A", "m/s2", past, "", 6.0, EPOCH_NS)
+    known = KnownPast("mems", "mems A", "A", "m/s2", past, "", 0.0, 6.0, EPOCH_NS)
     smoothed, hour_ns = Smoothed({"A": known}, {"B": "B has none"}), 3600 * 10**9
     V = np.array([[2.02, 1.01, 0.0]])
     a, why = smoothed.acceleration("A", V, EPOCH_NS - 12 * hour_ns, 22.0)
