@@ -1,6 +1,6 @@
 """Dates of changes in the past of `fieldcal show --past`: how often the stated interval contains the true time.
 
-    python -m benchmarks.dates [--draws 100] [--write]
+    python -m benchmarks.dates [--draws 40] [--write]
 
 Records of four windows a day for forty days are drawn by equations of their own (tests/drawn_records.py): S walks, the
 windows have noise (0.26 % of S each), and at a drawn time one main sensitivity changes at once, or begins to drift. The
@@ -76,7 +76,7 @@ def dated(case: Case, seed: int) -> tuple[float, Date]:
     state.take_also(records, [Step(float(np.nextafter(DAYS[found], -np.inf)), u)])
     state.merge_old(float(DAYS[-1]))
     (change,) = state.past().changes
-    return day, change.date
+    return day, change.dated()
 
 
 def _course(random: np.random.Generator, case: Case, day: float) -> Array:
@@ -113,7 +113,7 @@ def table(draws: int) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=100)
+    parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     text = f"`python -m benchmarks.dates`, {machine()}.\n\n{table(given.draws)}"

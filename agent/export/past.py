@@ -143,7 +143,7 @@ def _whole(one: SensorPast) -> dict[str, Any]:
                 "stated_u": dict(change.stated),
                 "found": dict(zip(PARAMETERS, change.found.tolist(), strict=True)),
                 "standard_uncertainty": dict(zip(PARAMETERS, change.standard_uncertainty.tolist(), strict=True)),
-                "date": _date_object(known, change.date),
+                "date": _date_object(known, change.dated()),
             }
             for change in past.changes
         ],
@@ -183,7 +183,7 @@ def write_csv(path: Path, found: Sequence[SensorPast]) -> int:
 def _cells(one: SensorPast) -> Iterator[list[str]]:
     if one.known is None:
         return
-    past, dates = one.known.past, {change.day: change.date for change in one.known.past.changes}
+    past, dates = one.known.past, {change.day: change.dated() for change in one.known.past.changes}
     for day, windows, law, own in zip(past.days.tolist(), past.windows, past.laws, one.in_force, strict=True):
         u = np.sqrt(law.covariance.diagonal()[:12]).tolist()
         numbers = [repr(value) for value in (*law.mean[:12].tolist(), *u)]
@@ -219,7 +219,7 @@ def lines(one: SensorPast) -> Iterator[str]:
         rows.append([date_of(known.utc_ns(day)), str(windows), *cells, "-" if own is None else str(own[1])])
     yield from aligned(rows)
     for change in past.changes:
-        yield f"{date_of(known.utc_ns(change.day))}  {_words(change, shown.factors, k)}; {_when(known, change.date)}"
+        yield f"{date_of(known.utc_ns(change.day))}  {_words(change, shown.factors, k)}; {_when(known, change.dated())}"
 
 
 def _words(change: Change, factors: Array, k: float) -> str:

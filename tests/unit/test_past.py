@@ -123,7 +123,7 @@ def test_the_date_of_a_step_is_that_of_the_dense_problem_with_the_step_in_each_g
     assert share.max() < 0.95  # so that both ends of the interval are in other gaps
     even = np.random.default_rng(1).permutation((np.arange(100_000) + 0.5) / 100_000)  # quantiles of the mixture
     days = np.interp(even, np.append(0.0, np.cumsum(share)), edges)
-    date = change.date
+    date = change.dated()
     assert date.by_windows
     np.testing.assert_allclose([date.day, *date.interval], [days.mean(), *np.quantile(days, [0.025, 0.975])], atol=2e-3)
     assert date.standard_uncertainty == pytest.approx(days.std(), rel=1e-3)
@@ -142,8 +142,9 @@ def test_a_step_within_merged_windows_is_dated_to_them_and_no_closer() -> None:
     state.merge_old(float(days[-1]))
     (change,) = state.past().changes
     assert change.day == found
-    np.testing.assert_allclose(change.date.interval, [14.0 + 0.025 * 0.75, 14.75 - 0.025 * 0.75], rtol=0, atol=1e-3)
-    assert change.date.standard_uncertainty == pytest.approx(0.75 / np.sqrt(12.0), rel=1e-3)
+    date = change.dated()
+    np.testing.assert_allclose(date.interval, [14.0 + 0.025 * 0.75, 14.75 - 0.025 * 0.75], rtol=0, atol=1e-3)
+    assert date.standard_uncertainty == pytest.approx(0.75 / np.sqrt(12.0), rel=1e-3)
 
 
 def test_the_date_of_a_found_drift_is_its_onset() -> None:
@@ -155,10 +156,10 @@ def test_the_date_of_a_found_drift_is_its_onset() -> None:
     records = [told(window, Truth(own, np.zeros(3)), t) for own, t in zip(S, days.tolist(), strict=True)]
     state.take_also(records, [Step(float(np.nextafter(19.0, np.inf)), {"Syy": 0.02, "Syy_rate": 3e-3})])
     (change,) = state.past().changes
-    low, high = change.date.interval
-    assert low < day < high
-    assert change.date.day == pytest.approx(day, abs=2.0 * change.date.standard_uncertainty)
-    assert 0.1 < change.date.standard_uncertainty < 0.6
+    date = change.dated()
+    assert date.interval[0] < day < date.interval[1]
+    assert date.day == pytest.approx(day, abs=2.0 * date.standard_uncertainty)
+    assert 0.1 < date.standard_uncertainty < 0.6
 
 
 def test_the_date_of_a_stated_change_is_between_the_windows_before_and_after_it() -> None:
@@ -167,7 +168,7 @@ def test_the_date_of_a_stated_change_is_between_the_windows_before_and_after_it(
     state.update(Record.of(building_window(np.random.default_rng(8), level_mps2=(0.1, 0.1, 0.1)), 22.5))
     change = state.past().changes[-1]
     assert change.day == np.nextafter(18.5, np.inf)
-    date = change.date
+    date = change.dated()
     assert not date.by_windows
     np.testing.assert_allclose([date.day, *date.interval], [20.5, 18.6, 22.4], rtol=1e-12)
     assert date.standard_uncertainty == pytest.approx(4.0 / np.sqrt(12.0))
