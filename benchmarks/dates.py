@@ -1,6 +1,6 @@
 """Dates of changes in the past of `fieldcal show --past`: how often the stated interval contains the true time.
 
-    python -m benchmarks.dates [--draws 40] [--write]
+    python -m benchmarks.dates [--draws 34] [--write]
 
 Records of four windows a day for forty days are drawn by equations of their own (tests/drawn_records.py): S walks, the
 windows have noise (0.26 % of S each), and at a drawn time one main sensitivity changes at once, or begins to drift. The
@@ -71,7 +71,7 @@ def dated(case: Case, seed: int) -> tuple[float, Date]:
     state = State(MEAN, U, Priors(reference=1e-3, offset_mps2=0.01), Wander(sensitivity=WALK), TemperatureModel(),
                   fixed=True)  # fmt: skip
     state.meet("A")
-    records = [_window(random, S, float(t)) for S, t in zip(_course(random, case, day), DAYS, strict=True)]
+    records = [window(random, S, float(t)) for S, t in zip(_course(random, case, day), DAYS, strict=True)]
     u = {"Syy": FOUND, "Syy_rate": case.rate} if case.rate else JUMP
     state.take_also(records, [Step(float(np.nextafter(DAYS[found], -np.inf)), u)])
     state.merge_old(float(DAYS[-1]))
@@ -89,7 +89,8 @@ def _course(random: np.random.Generator, case: Case, day: float) -> Array:
     return np.asarray(S)
 
 
-def _window(random: np.random.Generator, S: Array, day: float) -> Record:
+def window(random: np.random.Generator, S: Array, day: float) -> Record:
+    """A window on a day with this S (3, 3)."""
     slopes = NOISE * random.normal(size=(6, 3))
     return told(WINDOW, Truth(S, np.zeros(3)), day, slope_noise=slopes, mean_noise=0.01 * random.normal(size=3))
 
@@ -113,7 +114,7 @@ def table(draws: int) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=40)
+    parser.add_argument("--draws", type=int, default=34)
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     text = f"`python -m benchmarks.dates`, {machine()}.\n\n{table(given.draws)}"

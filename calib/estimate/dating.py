@@ -182,13 +182,14 @@ class _Supposed:
         return np.asarray(self._unknowns.passage(t, day)[0] @ self._moves)
 
     def _moved(self, record: Record, t: float) -> Array | float:
-        """D (N, m) as a record has it: the mean of that of its windows, which are spread evenly over its days."""
+        """D (N, m) as a record has it: the mean of that of its windows, as if they were spread evenly over its days."""
         first, last = record.days
         if t > last:
             return 0.0
         if t <= first:
             return self._moved_at(record.day, t)
-        return (last - t) / (last - first) * self._moved_at(0.5 * (t + last), t)
+        later = np.ceil((record.windows - 1) * (last - t) / (last - first))
+        return np.asarray(later / record.windows * self._moved_at(0.5 * (t + last), t))
 
     def cost(self, t: float) -> float:
         """What it costs to suppose the change at the time t."""

@@ -333,6 +333,45 @@ def test_what_cannot_be_corrected_is_refused_with_a_remedy(
     assert "--data-dir names the windows for --corrected" in err
 
 
+def test_what_makes_u_of_any_calibration_is_told_by_store_and_recording(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of an earlier one, the numbers are those of the run that ended with it."""
+
+    def budget(number: int, *of: str | Path) -> dict[str, Any]:
+        status, out, err = run(capsys, "show", "--budget", str(number), *of, "--json", "-")
+        assert (status, err) == (0, "")
+        told = dict(json.loads(out))
+        assert told["sequence"] == number
+        np.testing.assert_allclose(told["u_over_u_in_force"], 1.0, rtol=0, atol=0.01)
+        return dict(told["budget"])
+
+    def newest(directory: Path) -> dict[str, Any]:
+        return dict(json.loads(run(capsys, "show", "--data-dir", directory, "--json", "-")[1])["sensors"]["mems"])
+
+    record(tmp_path / "shorter", 45.0)
+    for ended in (kept, tmp_path / "shorter"):
+        told = newest(ended)
+        for of in (["--data-dir", kept], [kept / RECORDING]):
+            assert budget(told["calibration"]["sequence"], *of) == told["budget"]
+    third = told["calibration"]["sequence"]
+    assert third < newest(kept)["calibration"]["sequence"]
+    lines = run(capsys, "show", "--budget", str(third), kept / RECORDING)[1].splitlines()
+    assert lines[0].startswith(f"mems: calibration {third} of run run-1, in force since 2026-09-21")
+    assert len(lines) == 3 + len(told["budget"]["standard_uncertainty"])
+    gone = shutil.copytree(kept, tmp_path / "gone")
+    (gone / RECORDING).unlink()
+    for arguments, status, words in (
+        (["1", kept / RECORDING], 2, "has no calibration with the number 1"),
+        (["1", "--data-dir", kept], 2, "no calibration with the number 1 is kept"),
+        ([str(third), "--data-dir", gone], 3, "the recording fieldcal-000001.mcap does not exist any more"),
+        ([str(third), "--past"], 2, "--past and --budget show different things"),
+    ):
+        found, out, err = run(capsys, "show", "--budget", *arguments)
+        assert (found, out) == (status, "")
+        assert words in err
+
+
 def test_show_and_report_say_what_makes_u(kept: Path, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sensor = json.loads(run(capsys, "show", "--data-dir", kept, "--json", "-")[1])["sensors"]["mems"]
     budget, update = sensor["budget"], sensor["calibration"]
