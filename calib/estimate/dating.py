@@ -7,8 +7,8 @@ own and all later rows say. A change at the time t moves the unknowns behind t b
 
 so that one small QR joins both triangles for a supposed time. Its chi-squared and its determinant are minus twice the
 log-likelihood (Willsky and Jones 1976, with a prior of the size in place of its maximum). U has the change as all
-windows found it, of which the size is free, and beside it that of each rate: with all unknowns of a step free, noise
-alone would explain a change next to the first or the last window. What changed by less than SIGNIFICANT standard
+windows found it, of which the size is free, or of a drift its rates: with all unknowns of a step free, noise alone
+would explain a change next to the first or the last window. What changed by less than SIGNIFICANT standard
 uncertainties did not change, unless nothing changed by more. Of windows that were merged over t, the record has
 the change in the share of them that came later; how they were spread over its days nobody knows, so that within
 these all times are alike.
@@ -36,6 +36,7 @@ PROBABILITY = 0.95  # with which the interval of a date contains the time of the
 # again: of windows that were merged over the change, the share that came later is known well.
 NEGLIGIBLE, FINE, ROUNDS = 1e-6, 48, 3
 SIGNIFICANT = 3.0  # standard uncertainties of a change
+ROUNDING = 1e-6  # standard uncertainties
 APART_DAYS = 1e-9  # steps stand so near to a window
 
 
@@ -104,17 +105,18 @@ def _even_in_merged(records: Sequence[Record], edges: Array, probability: Array)
 
 
 def _moves(then: Then) -> Array:
-    """U (N, m): the change that was found, and apart from it the one of each rate."""
-    at = then.now.unknowns.at
-    u = np.linalg.norm(then.moved_factor, axis=1)
+    """U (N, m): of a drift each rate that changed, else the change that was found; where nothing was found, since no
+    window came yet, what was stated of each parameter of S and Q."""
+    at, u = then.now.unknowns.at, np.linalg.norm(then.moved_factor, axis=1)
     rates = [at[name] for name in ALL_RATES if name in at and u[at[name]] > 0.0]
-    surely = np.abs(then.moved) > SIGNIFICANT * u
-    surely[rates] = False
-    values = np.where(surely, then.moved, 0.0) if surely.any() else then.moved.copy()
-    values[rates] = 0.0
-    own = np.zeros((len(values), len(rates)))
-    own[rates, range(len(rates))] = np.hypot(then.moved, u)[rates]
-    return np.column_stack([values, own])
+    if rates:
+        return np.diag(np.hypot(then.moved, u))[:, rates]
+    found = np.abs(then.moved) > SIGNIFICANT * u
+    if found.any():
+        return np.where(found, then.moved, 0.0)[:, None]
+    if (np.abs(then.moved) > ROUNDING * u).any():
+        return then.moved[:, None]
+    return then.moved_factor[:, (then.moved_factor[:12] != 0.0).any(axis=0)]
 
 
 def _probability(cost: Callable[[float], float], edges: Array) -> Array:

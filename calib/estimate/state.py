@@ -397,7 +397,7 @@ class State:
         kinds = [then.now.quantities[then.now.index(key)].kind for key in keys]
         if all("remount" in kind.loosened_by for kind in kinds) or any(own.day == day for own in self._dated):
             return partial(stated_date, whole.records, day)
-        begin, end = max(d for d in known if d < day), min(d for d in known if d > day)
+        begin, end = max(d for d in known if d < day), min((d for d in known if d > day), default=day)
         return cache(partial(found_date, whole, then, day, begin, end))
 
     def budget(self, whole: Estimate | None = None) -> Sources:

@@ -147,9 +147,11 @@ def test_a_step_within_merged_windows_is_dated_to_them_and_no_closer() -> None:
     assert date.standard_uncertainty == pytest.approx(0.75 / np.sqrt(12.0), rel=1e-3)
 
 
-def test_the_date_of_a_found_drift_is_its_onset() -> None:
-    """A drift by 0.3 % a day, found when it has made 2 %. A window tells S to 0.13 %, so the onset to half a day."""
-    days, day = np.arange(0.0, 30.0, 0.5), 12.2
+@pytest.mark.parametrize(("every", "last"), [(0.5, 19.0), (0.5, 29.5), (5.0, 40.0)])
+def test_the_date_of_a_found_drift_is_its_onset(every: float, last: float) -> None:
+    """A drift by 0.3 % a day, found on day 19. A window tells S to 0.13 %, so the onset to half a day, also between two
+    windows that are five days apart, and where no window came since it was found."""
+    days, day = np.arange(0.0, last + every, every), 12.2
     wander, priors = Wander(dict(STILL.values) | {"sensitivity": 1e-6}), Priors(offset_mps2=1e-3)
     state, window = State(LEVEL, U, priors, wander, TemperatureModel(), fixed=True), template(PLACE, noise=0.05)
     S = [np.eye(3) + np.diag([0.0, 3e-3 * max(t - day, 0.0), 0.0]) for t in days.tolist()]
@@ -159,7 +161,7 @@ def test_the_date_of_a_found_drift_is_its_onset() -> None:
     date = change.dated()
     assert date.interval[0] < day < date.interval[1]
     assert date.day == pytest.approx(day, abs=2.0 * date.standard_uncertainty)
-    assert 0.1 < date.standard_uncertainty < 0.6
+    assert 0.1 < date.standard_uncertainty < 0.7
 
 
 def test_the_date_of_a_stated_change_is_between_the_windows_before_and_after_it() -> None:
