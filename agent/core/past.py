@@ -16,6 +16,7 @@ from agent.core.events import CalibrationUpdate
 from agent.core.kept import MALFORMED, update_of
 from agent.core.memory import Memory
 from agent.core.snapshot import pack, unpack
+from calib.estimate.dating import Date
 from calib.estimate.past import Past
 from calib.estimate.sources import Sources
 
@@ -74,6 +75,14 @@ def past_of(memory: Memory) -> KnownPast:
         own, days = estimation.state, (float(state["day"]), int(state["t_utc_ns"]))
         of = memory.sensor, memory.identity, state["device"], unit
         return KnownPast(*of, own.past(), sha256, own.reference_frequency_hz, *days)
+    except MALFORMED as error:
+        raise _unreadable(error) from None
+
+
+def dates_of(known: KnownPast) -> list[Date]:
+    """When the changes of a past came, in their order. Raises PastError."""
+    try:
+        return [change.dated() for change in known.past.changes]
     except MALFORMED as error:
         raise _unreadable(error) from None
 

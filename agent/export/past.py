@@ -13,7 +13,7 @@ import numpy as np
 from agent.core.events import CalibrationUpdate, RunStart, StatusChange
 from agent.core.kept import update_of
 from agent.core.memory import Memory
-from agent.core.past import KnownPast, PastError, past_of
+from agent.core.past import KnownPast, PastError, dates_of, past_of
 from agent.core.snapshot import unpack
 from agent.delivery.calibrations import made
 from agent.delivery.history import History
@@ -36,12 +36,14 @@ InForce = tuple[tuple[str, int], str] | None  # the same, with the identity of t
 @dataclass(frozen=True, slots=True)
 class SensorPast:
     """The past of a sensor with one device. `known` is None where it has none, for the reason `why`. `in_force` (K,):
-    the calibration in force at each epoch; None where none was, or where its result is no longer kept."""
+    the calibration in force at each epoch; None where none was, or where its result is no longer kept. `dates`: those
+    of its changes."""
 
     sensor: str
     identity: str
     known: KnownPast | None
     in_force: Sequence[Made] = ()
+    dates: Sequence[Date] = ()
     why: str = ""
 
 
@@ -95,6 +97,7 @@ def _came(recordings: Sequence[Path], faults: list[str]) -> dict[str, list[tuple
 def _past(memory: Memory, in_force_at: Callable[[str, Sequence[int]], list[InForce]]) -> SensorPast:
     try:
         known = past_of(memory)
+        dates = dates_of(known)
     except PastError as error:
         return SensorPast(memory.sensor, memory.identity, None, why=str(error))
     times = [known.utc_ns(day) for day in known.past.days.tolist()]
@@ -102,7 +105,7 @@ def _past(memory: Memory, in_force_at: Callable[[str, Sequence[int]], list[InFor
     in_force = [
         own[0] if own is not None and (windows or own[1] == memory.identity) else None for own, windows in found
     ]
-    return SensorPast(memory.sensor, memory.identity, known, in_force)
+    return SensorPast(memory.sensor, memory.identity, known, in_force, dates)
 
 
 def as_object(found: Sequence[SensorPast]) -> list[dict[str, Any]]:
@@ -143,9 +146,9 @@ def _whole(one: SensorPast) -> dict[str, Any]:
                 "stated_u": dict(change.stated),
                 "found": dict(zip(PARAMETERS, change.found.tolist(), strict=True)),
                 "standard_uncertainty": dict(zip(PARAMETERS, change.standard_uncertainty.tolist(), strict=True)),
-                "date": _date_object(known, change.dated()),
+                "date": _date_object(known, date),
             }
-            for change in past.changes
+            for change, date in zip(past.changes, one.dates, strict=True)
         ],
     }
 
@@ -183,7 +186,8 @@ def write_csv(path: Path, found: Sequence[SensorPast]) -> int:
 def _cells(one: SensorPast) -> Iterator[list[str]]:
     if one.known is None:
         return
-    past, dates = one.known.past, {change.day: change.dated() for change in one.known.past.changes}
+    past = one.known.past
+    dates = {change.day: date for change, date in zip(past.changes, one.dates, strict=True)}
     for day, windows, law, own in zip(past.days.tolist(), past.windows, past.laws, one.in_force, strict=True):
         u = np.sqrt(law.covariance.diagonal()[:12]).tolist()
         numbers = [repr(value) for value in (*law.mean[:12].tolist(), *u)]
@@ -218,8 +222,8 @@ def lines(one: SensorPast) -> Iterator[str]:
         cells = [plus_minus(value, expanded) if known_ else "not known" for value, expanded, known_ in told]
         rows.append([date_of(known.utc_ns(day)), str(windows), *cells, "-" if own is None else str(own[1])])
     yield from aligned(rows)
-    for change in past.changes:
-        yield f"{date_of(known.utc_ns(change.day))}  {_words(change, shown.factors, k)}; {_when(known, change.dated())}"
+    for change, date in zip(past.changes, one.dates, strict=True):
+        yield f"{date_of(known.utc_ns(change.day))}  {_words(change, shown.factors, k)}; {_when(known, date)}"
 
 
 def _words(change: Change, factors: Array, k: float) -> str:

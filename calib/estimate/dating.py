@@ -53,7 +53,12 @@ class Date:
 
     @classmethod
     def of(cls, edges: Array, probability: Array, *, by_windows: bool) -> Self:
-        """From the probability (n,) of each stretch of time between `edges` (n + 1,), within which it is even."""
+        """From the probability (n,) of each stretch of time between `edges` (n + 1,), within which it is even.
+
+        Raises ValueError where it is not finite.
+        """
+        if not (np.isfinite(edges).all() and np.isfinite(probability).all()):
+            raise ValueError("the windows tell no time of a change")
         share = probability / probability.sum()
         middle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
         mean = float(share @ middle)

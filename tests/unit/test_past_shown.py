@@ -283,6 +283,20 @@ def test_a_store_without_a_state_and_a_state_of_an_earlier_version_are_told(
     assert not to.exists()
 
 
+@pytest.mark.parametrize("u", [np.nan, -1.0, 1e300])
+def test_a_step_of_no_size_is_one_line(u: float, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def stepped(state: bytes) -> bytes:
+        held = unpack(state)
+        own = held["estimation"]["state"]
+        own["steps"].append({"day": float(np.nextafter(own["records"][2]["day"], -np.inf)), "u": {"Sxx": u}})
+        return pack(held)
+
+    change_memory(copied, stepped)
+    status, out, err = run(capsys, "show", "--past", "--data-dir", copied)
+    assert (status, err) == (0, "")
+    assert "its state cannot be read" in out or "; it came " in out.splitlines()[-1]
+
+
 @pytest.mark.parametrize("damage", ["bytes", "content", "page"])
 def test_a_damaged_state_is_one_line(damage: str, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if damage == "bytes":
