@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from agent.cli.data_dir import DATA_DIR
+from agent.cli.finite import Finite
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".csv", ".parquet", ".wav", ".mseed")
 NUMBERED = ENDINGS[:2]  # the formats that can name a calibration for each sample
+EPOCHS = ".xml"  # has no samples
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -28,7 +30,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "--to",
     type=_FILE,
     metavar="FILE",
-    help="Table of samples: .csv, .parquet, .wav or .mseed; it must not exist.",
+    help="Table of samples: .csv, .parquet, .wav or .mseed; with --corrected also .xml: the epochs of S and Q as "
+    "StationXML. It must not exist.",
 )
 @click.option("--mcap", type=_FILE, metavar="FILE", help="Topics of ROS 2 for plot programs; it must not exist.")
 @click.option("--device", metavar="NAME", help="The device. Default: the only sensor of the recordings.")
@@ -44,26 +47,39 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     is_flag=True,
     help="Accelerations by S(t) and Q(t), smoothed over the past: by all windows up to the end of the recordings.",
 )
+@click.option(
+    "--place",
+    nargs=3,
+    type=(Finite(-90.0, 90.0), Finite(-180.0, 180.0), Finite()),
+    metavar="LATITUDE LONGITUDE ELEVATION",
+    help="Where the sensor is, in degrees and m, for StationXML.",
+)
 @DATA_DIR
 def export(
     recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, device: str | None, rate_hz: float,
-    corrected: bool, data_dir: Path | None,
+    corrected: bool, place: tuple[float, float, float] | None, data_dir: Path | None,
 ) -> int:  # fmt: skip
     """Write the samples of RECORDING (several: in the order given) with the times of their clock.
 
     A sensor has its indications and, where it was calibrated, accelerations by the newest calibration. With --corrected
     they are those by S and Q at the time of each sample, by all windows before and after it, and each sample has the
     number of the calibration that was in force then; the head of the file says what the smoothing follows from. The
-    windows are those up to the end of the recordings, or with --data-dir all that the agent has kept.
+    windows are those up to the end of the recordings, or with --data-dir all that the agent has kept. With the ending
+    .xml the epochs of S and Q themselves are written, as StationXML for the channels that .mseed has.
 
     Exit status 0 if the files are written, 2 on bad input.
     """
     from agent.delivery.history import StoreError
     from agent.export.samples import ExportError, content_of
 
-    _check(to, mcap, data_dir, corrected=corrected)
+    _check(to, mcap, place, data_dir, corrected=corrected)
     try:
         content = content_of(recordings, device)
+        if corrected:
+            _check_axes(recordings, content)
+        if to is not None and to.suffix == EPOCHS and place is not None:
+            _write_epochs(recordings, content, to, place, data_dir)
+            return 0
         if corrected:
             content.smoothed = _smoothed(recordings, content, data_dir)
         for fault in content.faults:
@@ -85,14 +101,24 @@ def export(
     return 0
 
 
-def _check(to: Path | None, mcap: Path | None, data_dir: Path | None, *, corrected: bool) -> None:
+def _check(
+    to: Path | None, mcap: Path | None, place: tuple[float, float, float] | None, data_dir: Path | None, *,
+    corrected: bool,
+) -> None:  # fmt: skip
     """Raise click.UsageError for options that do not go together."""
     if to is None and mcap is None:
         raise click.UsageError("nothing to write; add --to FILE, --mcap FILE, or both")
-    if to is not None and to.suffix not in ENDINGS:
-        raise click.BadParameter(f"{to}: the ending must be one of {', '.join(ENDINGS)}", param_hint="--to")
-    if corrected and (to is None or to.suffix not in NUMBERED or mcap is not None):
-        raise click.UsageError(f"--corrected writes one file with the ending {' or '.join(NUMBERED)}; name it with -o")
+    if to is not None and to.suffix not in (*ENDINGS, EPOCHS):
+        raise click.BadParameter(f"{to}: the ending must be one of {', '.join([*ENDINGS, EPOCHS])}", param_hint="--to")
+    if corrected and (to is None or to.suffix not in (*NUMBERED, EPOCHS) or mcap is not None):
+        endings = " or ".join(NUMBERED)
+        raise click.UsageError(f"--corrected writes one file with the ending {endings}, or {EPOCHS}; name it with -o")
+    if (epochs := to is not None and to.suffix == EPOCHS) and not corrected:
+        raise click.UsageError(f"{to}: StationXML has the epochs of the past; add --corrected")
+    if epochs and place is None:
+        raise click.UsageError("StationXML wants the place of the sensor; add --place LATITUDE LONGITUDE ELEVATION")
+    if place is not None and not epochs:
+        raise click.UsageError(f"--place belongs to StationXML; write a file that ends in {EPOCHS}, or remove --place")
     if data_dir is not None and not corrected:
         raise click.UsageError("--data-dir names the windows for --corrected; add that, or remove --data-dir")
 
@@ -113,17 +139,46 @@ def _write(recordings: Sequence[Path], content: Content, to: Path | None, mcap: 
         say(f"{mcap}: {count} messages of {content.device} at {rate_hz:g} Hz")
 
 
-def _smoothed(recordings: Sequence[Path], content: Content, data_dir: Path | None) -> Smoothed:
-    """The past by the states where the recordings end, or by those in a data directory."""
+def _check_axes(recordings: Sequence[Path], content: Content) -> None:
+    """Raise ExportError for a device without S and Q; go on with the kernels of the recordings."""
     from agent.cli.kernels import compute_as_in
-    from agent.delivery.history import FILE_NAME, History
-    from agent.export.at_the_end import memories_at_the_end
     from agent.export.samples import ExportError
-    from agent.export.smoothing import smoothed
 
     compute_as_in(recordings[0])
     if content.axes != 3:
         raise ExportError(f"{recordings[0]}: {content.device} has {content.axes} axis; S and Q are those of three axes")
+
+
+def _write_epochs(
+    recordings: Sequence[Path], content: Content, to: Path, place: tuple[float, float, float], data_dir: Path | None
+) -> None:
+    """Write the epochs of the past as StationXML. Raises ExportError, StoreError, OSError."""
+    from agent.delivery.history import FILE_NAME, History
+    from agent.export.past import pasts, pasts_of
+    from agent.export.samples import samples, start_of
+    from agent.export.seismic import rate_of
+    from agent.export.stationxml import Place, write_stationxml
+
+    if data_dir is None:
+        found = pasts_of(recordings, [])
+    else:
+        with History(data_dir / FILE_NAME) as history:
+            found = pasts(history)
+    for fault in content.faults:
+        say(f"fieldcal export: {fault}", err=True)
+    own = [one for one in found if one.sensor == content.device]
+    rate_hz = next(map(rate_of, samples(recordings, content)), 0.0)
+    site = start_of(recordings[0]).site
+    count = write_stationxml(to, content, own, site=site, rate_hz=rate_hz, place=Place(*place))
+    say(f"{to}: {count} epochs of {content.device}")
+
+
+def _smoothed(recordings: Sequence[Path], content: Content, data_dir: Path | None) -> Smoothed:
+    """The past by the states where the recordings end, or by those in a data directory."""
+    from agent.delivery.history import FILE_NAME, History
+    from agent.export.at_the_end import memories_at_the_end
+    from agent.export.smoothing import smoothed
+
     if data_dir is None:
         memories = memories_at_the_end(recordings)
     else:

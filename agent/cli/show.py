@@ -22,6 +22,7 @@ from agent.terminal.text import one_line, say
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
     from agent.core.memory import Memory
+    from agent.export.past import SensorPast
     from agent.terminal.console import TextConsole
     from calib.estimate.sources import Sources
 
@@ -30,6 +31,7 @@ HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
 
 
 @click.command()
+@click.argument("recordings", nargs=-1, type=click.Path(path_type=Path, dir_okay=False), metavar="[RECORDING]...")
 @click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True, metavar="D",
               help="Where the agent keeps recordings and state.")  # fmt: skip
 @click.option("--json", "json_to", metavar="-|FILE", help="One JSON object on standard output, or in FILE.")
@@ -43,35 +45,54 @@ HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
     metavar="FILE",
     help="With --past: a row for each epoch; the file must not exist.",
 )
+@click.option("--budget", type=click.IntRange(1), metavar="NUMBER",
+              help="Show what makes U of the calibration with this number instead.")  # fmt: skip
 @click.option("--public-key", metavar="K", type=click.Path(path_type=Path),
               help="Show only results that this key (PEM) signed.")  # fmt: skip
 @click.option("--limit", type=click.IntRange(1), default=HISTORY_SHOWN, show_default=True, metavar="N",
               help="Show the newest N calibrations and windows of each sensor.")  # fmt: skip
+@click.pass_context
 def show(
-    data_dir: Path, json_to: str | None, past: bool, csv_to: Path | None, public_key: Path | None, limit: int
+    context: click.Context, recordings: tuple[Path, ...], data_dir: Path, json_to: str | None, past: bool,
+    csv_to: Path | None, budget: int | None, public_key: Path | None, limit: int,
 ) -> int:  # fmt: skip
     """Show calibration in force, status, history and recordings of a data directory.
 
     A result that the gateway signed is shown as it was signed. One whose signature is not valid is not shown.
 
     With --past: S and Q with U at each epoch, by all windows before and after it, with the number of the calibration
-    that was in force then, and what changed at once. Old windows are merged to hours, days, weeks, months and years.
+    that was in force then, and what changed at once, with its date. Old windows are merged to hours, days, weeks,
+    months and years. With RECORDING, recordings of one gateway take the place of the data directory: the windows are
+    those up to the end of the one that ends last, which is replayed.
 
-    Exit status 2 if there is no store, or if it cannot be read; 3 if a result is refused, with the reasons.
+    With --budget: the sources of U of the calibration with that number, each with what it alone would make of U. Where
+    its result does not say them, the recording in which it was made is replayed up to it.
+
+    Exit status 2 if there is no store, or if it or a recording cannot be read; 3 if a result is refused, or if windows
+    do not tell what makes U, with the reasons.
     """
     from agent.config.key_file import KeyFileError
+    from agent.export.samples import ExportError
 
     if csv_to is not None and not past:
         raise click.UsageError("--csv writes the past; add --past, or remove --csv")
+    if past and budget is not None:
+        raise click.UsageError("--past and --budget show different things; remove one of them")
+    if recordings:
+        _check_recordings(context, needed=past or budget is not None)
     try:
         if past:
-            return _show_past(data_dir, json_to, csv_to, public_key)
+            found, refused = (_past_of(recordings), False) if recordings else _past_in(data_dir, public_key)
+            _show_past(recordings or (data_dir,), found, json_to, csv_to)
+            return 3 if refused else 0
+        if budget is not None:
+            return _show_budget(recordings, data_dir, budget, json_to, public_key)
         overview = read_overview(data_dir, limit, public_key)
         if json_to:
             _write_json(as_object(overview), json_to)
         else:
             _print(overview)
-    except (StoreError, KeyFileError) as error:
+    except (StoreError, KeyFileError, ExportError) as error:
         say(f"fieldcal show: {error}", err=True)
         return 2
     except OSError as error:
@@ -90,24 +111,91 @@ def _write_json(found: dict[str, Any], to: str) -> None:
         Path(to).write_bytes(data + b"\n")
 
 
-def _show_past(data_dir: Path, json_to: str | None, csv_to: Path | None, public_key: Path | None) -> int:
-    """Show the past of all sensors; returns the exit status. Raises StoreError, KeyFileError, OSError."""
-    from agent.export.past import as_object as past_object
-    from agent.export.past import lines, pasts, write_csv
+def _check_recordings(context: click.Context, *, needed: bool) -> None:
+    """Raise click.UsageError for options that do not go together with recordings."""
+    if not needed:
+        raise click.UsageError(
+            "recordings tell the past; add --past or --budget, or name a data directory with --data-dir D"
+        )
+    for name, option in (("data_dir", "--data-dir"), ("public_key", "--public-key")):
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            raise click.UsageError(
+                f"{option} belongs to a data directory; remove it, or the recordings (`fieldcal audit` checks these)"
+            )
+
+
+def _past_in(data_dir: Path, public_key: Path | None) -> tuple[list[SensorPast], bool]:
+    """The past of all sensors, and whether a result is refused. Raises StoreError, KeyFileError, OSError."""
+    from agent.export.past import pasts
 
     with History(data_dir / FILE_NAME, keys := _keys(public_key), signed_only=keys is not None) as history:
         history.check()
         found = pasts(history)
     for sequence, reason in sorted(history.refused.items()):
         say(f"fieldcal show: result {sequence} is refused: {reason}", err=True)
+    return found, bool(history.refused)
+
+
+def _past_of(recordings: Sequence[Path]) -> list[SensorPast]:
+    """The past of all sensors of recordings. Raises ExportError, OSError."""
+    from agent.cli.kernels import compute_as_in
+    from agent.export.past import pasts_of
+
+    compute_as_in(recordings[0])
+    found = pasts_of(recordings, faults := list[str]())
+    for fault in faults:
+        say(f"fieldcal show: {fault}", err=True)
+    return found
+
+
+def _show_past(
+    sources: Sequence[Path], found: Sequence[SensorPast], json_to: str | None, csv_to: Path | None
+) -> None:  # fmt: skip
+    """Show the past of all sensors, as a data directory or recordings tell it. Raises OSError."""
+    from agent.export.past import as_object as past_object
+    from agent.export.past import lines, write_csv
+
     if csv_to is not None:
         say(f"{csv_to}: {write_csv(csv_to, found)} epochs", err=json_to == "-")
     if json_to:
-        _write_json({"version": __version__, "data_dir": str(data_dir), "past": past_object(found)}, json_to)
+        named = {"recordings": list(map(str, sources))} if sources[0].is_file() else {"data_dir": str(sources[0])}
+        _write_json({"version": __version__, **named, "past": past_object(found)}, json_to)
     elif csv_to is None:
-        for line in [line for one in found for line in lines(one)] or [f"{data_dir}: no state is kept yet"]:
+        for line in [line for one in found for line in lines(one)] or [f"{sources[0]}: no state is kept yet"]:
             say(line)
-    return 3 if history.refused else 0
+
+
+def _show_budget(
+    recordings: Sequence[Path], data_dir: Path, number: int, json_to: str | None, public_key: Path | None
+) -> int:  # fmt: skip
+    """Show what makes U of a calibration; returns the exit status. Raises ExportError, StoreError, OSError."""
+    from agent.cli.kernels import compute_as_in
+    from agent.core.past import PastError
+    from agent.export.budgets import budget_in, budget_of
+
+    try:
+        if recordings:
+            compute_as_in(recordings[0])
+            found = budget_of(recordings, number)
+        else:
+            with History(data_dir / FILE_NAME, keys := _keys(public_key), signed_only=keys is not None) as history:
+                found = budget_in(history, data_dir, number)
+    except PastError as error:
+        say(f"fieldcal show: what makes U of the calibration {number} is not known: {error}", err=True)
+        return 3
+    update, sources = found.update, found.sources
+    run, made = update.made
+    ratio = sources.standard_uncertainty / update.standard_uncertainty
+    if json_to:
+        told = {"sensor": update.sensor, "run_id": run, "sequence": made, "budget": _budget_object(sources)}
+        times = [float(ratio.min()), float(ratio.max())]
+        _write_json({"version": __version__, **told, "u_over_u_in_force": times}, json_to)
+        return 0
+    say(f"{update.sensor}: calibration {made} of run {run}, in force since {_time(update.t_utc_ns)}")
+    for line in _budget_lines(sources, update.output_unit, most=None):
+        say(line)
+    say(f"u of all sources together is {ratio.min():.4f} to {ratio.max():.4f} times u of the calibration")
+    return 0
 
 
 def _keys(public_key: Path | None) -> KnownKeys | None:
@@ -300,8 +388,8 @@ def _budget_object(budget: Sources | str) -> dict[str, Any]:
     }
 
 
-def _budget_lines(budget: Sources | str, unit: str) -> Iterator[str]:
-    """The largest sources of U, each with its part of U of the main sensitivities and of Q."""
+def _budget_lines(budget: Sources | str, unit: str, most: int | None = SOURCES_SHOWN) -> Iterator[str]:
+    """The largest sources of U (`most`; None: all), each with its part of U of the main sensitivities and of Q."""
     from calib.model import PARAMETERS
     from calib.recorded.output_unit import shown_in
     from calib.rounding import aligned, rounded
@@ -311,9 +399,10 @@ def _budget_lines(budget: Sources | str, unit: str) -> Iterator[str]:
         return
     chosen = [0, 4, 8, 9, 10, 11]
     factors = budget.coverage_factor * shown_in(unit).factors
-    largest = list(budget.by_source.items())[:SOURCES_SHOWN]
+    largest = list(budget.by_source.items())[:most]
+    heading = "sources" if most is None else "largest sources"
     rows = [(source, *map(rounded, (factors * u)[chosen].tolist())) for source, u in largest]
-    yield from aligned([("largest sources", *(f"U({PARAMETERS[k]})" for k in chosen)), *rows])
+    yield from aligned([(heading, *(f"U({PARAMETERS[k]})" for k in chosen)), *rows])
 
 
 def _since(calibration: CalibrationUpdate) -> str:

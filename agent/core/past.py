@@ -16,6 +16,7 @@ from agent.core.events import CalibrationUpdate
 from agent.core.kept import MALFORMED, update_of
 from agent.core.memory import Memory
 from agent.core.snapshot import pack, unpack
+from calib.estimate.dating import Date
 from calib.estimate.past import Past
 from calib.estimate.sources import Sources
 
@@ -29,8 +30,8 @@ class KnownPast:
     """The past of a sensor by all windows of its kept state.
 
     `identity`: of the device with its settings, `device`: without those of its filters. `sha256`: of the state from
-    which it follows. `unit`: of the output, "" where no calibration is in force. `day` is the day of the state at
-    `t_utc_ns`.
+    which it follows. `unit`: of the output, "" where no calibration is in force. S holds at `reference_frequency_hz`.
+    `day` is the day of the state at `t_utc_ns`.
     """
 
     sensor: str
@@ -39,6 +40,7 @@ class KnownPast:
     unit: str
     past: Past
     sha256: str
+    reference_frequency_hz: float
     day: float
     t_utc_ns: int
 
@@ -70,8 +72,17 @@ def past_of(memory: Memory) -> KnownPast:
         in_force = update_of(state["in_force"])
         unit = "" if in_force is None else in_force.output_unit
         sha256 = hashlib.sha256(pack(state["estimation"]["state"])).hexdigest()
-        days = float(state["day"]), int(state["t_utc_ns"])
-        return KnownPast(memory.sensor, memory.identity, state["device"], unit, estimation.state.past(), sha256, *days)
+        own, days = estimation.state, (float(state["day"]), int(state["t_utc_ns"]))
+        of = memory.sensor, memory.identity, state["device"], unit
+        return KnownPast(*of, own.past(), sha256, own.reference_frequency_hz, *days)
+    except MALFORMED as error:
+        raise _unreadable(error) from None
+
+
+def dates_of(known: KnownPast) -> list[Date]:
+    """When the changes of a past came, in their order. Raises PastError."""
+    try:
+        return [change.dated() for change in known.past.changes]
     except MALFORMED as error:
         raise _unreadable(error) from None
 

@@ -2,57 +2,110 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agent.core.past import KnownPast, PastError, past_of
+from agent.core.events import CalibrationUpdate, RunStart, StatusChange
+from agent.core.kept import update_of
+from agent.core.memory import Memory
+from agent.core.past import KnownPast, PastError, dates_of, past_of
+from agent.core.snapshot import unpack
 from agent.delivery.calibrations import made
 from agent.delivery.history import History
-from agent.export.samples import new_file
+from agent.export.at_the_end import memories_at_the_end
+from agent.export.samples import followed, new_file, steps_of
 from agent.export.smoothing import date_of, smoothing
 from agent.export.tables import cell
+from calib.estimate.dating import PROBABILITY, Date
 from calib.estimate.past import Change
 from calib.model import PARAMETERS, Array
 from calib.recorded.output_unit import shown_in
-from calib.rounding import aligned, plus_minus
+from calib.rounding import aligned, plus_minus, rounded
 
+DATED = ("change", "u_change_days", "change_after", "change_before")  # columns of CSV
 SHOWN = ("Sxx", "Syy", "Szz", "Qx", "Qy", "Qz")
 Made = tuple[str, int] | None  # run and number of the result by which a calibration came into force first
+InForce = tuple[tuple[str, int], str] | None  # the same, with the identity of the device
 
 
 @dataclass(frozen=True, slots=True)
 class SensorPast:
     """The past of a sensor with one device. `known` is None where it has none, for the reason `why`. `in_force` (K,):
-    the calibration in force at each epoch; None where none was, or where its result is no longer kept."""
+    the calibration in force at each epoch; None where none was, or where its result is no longer kept. `dates`: those
+    of its changes."""
 
     sensor: str
     identity: str
     known: KnownPast | None
     in_force: Sequence[Made] = ()
+    dates: Sequence[Date] = ()
     why: str = ""
 
 
 def pasts(history: History) -> list[SensorPast]:
     """The pasts of all devices in a store. Raises StoreError."""
-    found = []
-    for memory in history.memories():
-        try:
-            known = past_of(memory)
-        except PastError as error:
-            found.append(SensorPast(memory.sensor, memory.identity, None, why=str(error)))
-            continue
-        times = [known.utc_ns(day) for day in known.past.days.tolist()]
-        records = history.in_force_at(memory.sensor, times)
-        in_force = [
-            made(record) if record is not None and (windows or record.identity == memory.identity) else None
-            for record, windows in zip(records, known.past.windows, strict=True)
-        ]
-        found.append(SensorPast(memory.sensor, memory.identity, known, in_force))
-    return found
+
+    def in_force_at(sensor: str, times_utc_ns: Sequence[int]) -> list[InForce]:
+        records = history.in_force_at(sensor, times_utc_ns)
+        return [None if record is None else (made(record), record.identity) for record in records]
+
+    return [_past(memory, in_force_at) for memory in history.memories()]
+
+
+def pasts_of(recordings: Sequence[Path], faults: list[str]) -> list[SensorPast]:
+    """The pasts of all devices in recordings of one gateway, by their windows; why one ends early is added to `faults`.
+
+    Raises ExportError.
+    """
+    came = _came(recordings, faults)
+
+    def in_force_at(sensor: str, times_utc_ns: Sequence[int]) -> list[InForce]:
+        own = came.get(sensor, [])
+        starts = [t_utc_ns for t_utc_ns, _, _ in own]
+        return [own[k - 1][2] if (k := bisect_right(starts, t)) else None for t in times_utc_ns]
+
+    return [_past(memory, in_force_at) for memory in memories_at_the_end(recordings)]
+
+
+def _came(recordings: Sequence[Path], faults: list[str]) -> dict[str, list[tuple[int, int, InForce]]]:
+    """By sensor, when each calibration of recordings came into force, or none was, in order; with the results' numbers.
+
+    The one that was in force before the first recording is known from its snapshot.
+    """
+    came: dict[str, set[tuple[int, int, InForce]]] = {}
+    for path in recordings:
+        with followed(path):
+            for step in steps_of(path, faults):
+                event, results = step.event, step.results
+                if isinstance(event, RunStart):
+                    held = [update_of(own["in_force"]) for own in unpack(event.snapshot)["channels"].values()]
+                    results = [*(update for update in held if update is not None), *results]
+                for result in results:
+                    if isinstance(result, CalibrationUpdate):
+                        own = came.setdefault(result.sensor, set())
+                        own.add((result.t_utc_ns, result.sequence, (result.made, result.identity)))
+                    elif isinstance(result, StatusChange) and result.status == "UNCALIBRATED":
+                        came.setdefault(result.sensor, set()).add((result.t_utc_ns, result.sequence, None))
+    return {sensor: sorted(own, key=lambda one: one[:2]) for sensor, own in came.items()}
+
+
+def _past(memory: Memory, in_force_at: Callable[[str, Sequence[int]], list[InForce]]) -> SensorPast:
+    try:
+        known = past_of(memory)
+        dates = dates_of(known)
+    except PastError as error:
+        return SensorPast(memory.sensor, memory.identity, None, why=str(error))
+    times = [known.utc_ns(day) for day in known.past.days.tolist()]
+    found = zip(in_force_at(memory.sensor, times), known.past.windows, strict=True)
+    in_force = [
+        own[0] if own is not None and (windows or own[1] == memory.identity) else None for own, windows in found
+    ]
+    return SensorPast(memory.sensor, memory.identity, known, in_force, dates)
 
 
 def as_object(found: Sequence[SensorPast]) -> list[dict[str, Any]]:
@@ -72,6 +125,7 @@ def _whole(one: SensorPast) -> dict[str, Any]:
         "windows": known.windows,
         "last_window_utc_ns": known.last_window_utc_ns,
         "output_unit": known.unit,
+        "reference_frequency_hz": known.reference_frequency_hz,
         "coverage_factor": past.coverage_factor,
         "epochs": [
             {
@@ -92,19 +146,31 @@ def _whole(one: SensorPast) -> dict[str, Any]:
                 "stated_u": dict(change.stated),
                 "found": dict(zip(PARAMETERS, change.found.tolist(), strict=True)),
                 "standard_uncertainty": dict(zip(PARAMETERS, change.standard_uncertainty.tolist(), strict=True)),
+                "date": _date_object(known, date),
             }
-            for change in past.changes
+            for change, date in zip(past.changes, one.dates, strict=True)
         ],
     }
 
 
+def _date_object(known: KnownPast, date: Date) -> dict[str, Any]:
+    return {
+        "t_utc_ns": known.utc_ns(date.day),
+        "standard_uncertainty_days": date.standard_uncertainty,
+        "interval_utc_ns": [known.utc_ns(day) for day in date.interval],
+        "probability": PROBABILITY,
+        "told_by": "windows" if date.by_windows else "statement",
+    }
+
+
 def write_csv(path: Path, found: Sequence[SensorPast]) -> int:
-    """Write a row for each epoch, with the smoothing of each device in the head. Returns the number of rows.
+    """Write a row for each epoch, with the smoothing of each device in the head; the epoch at a change has its date.
+    Returns the number of rows.
 
     Raises OSError, also where the file exists.
     """
     rows, u_names = 0, [f"u_{name}" for name in PARAMETERS]
-    names = ["sensor", "identity", "time", "windows", *PARAMETERS, *u_names, "calibration", "run"]
+    names = ["sensor", "identity", "time", "windows", *PARAMETERS, *u_names, "calibration", "run", *DATED]
     with new_file(path) as file:
         for one in found:
             if one.known is not None:
@@ -121,12 +187,21 @@ def _cells(one: SensorPast) -> Iterator[list[str]]:
     if one.known is None:
         return
     past = one.known.past
+    dates = {change.day: date for change, date in zip(past.changes, one.dates, strict=True)}
     for day, windows, law, own in zip(past.days.tolist(), past.windows, past.laws, one.in_force, strict=True):
         u = np.sqrt(law.covariance.diagonal()[:12]).tolist()
         numbers = [repr(value) for value in (*law.mean[:12].tolist(), *u)]
         run, number = own or ("", 0)
         named = [cell(one.sensor), cell(one.identity), date_of(one.known.utc_ns(day)), str(windows)]
-        yield [*named, *numbers, str(number), cell(run)]
+        yield [*named, *numbers, str(number), cell(run), *_date_cells(one.known, dates.get(day))]
+
+
+def _date_cells(known: KnownPast, date: Date | None) -> list[str]:
+    if date is None:
+        return [""] * len(DATED)
+    days = date.day, *date.interval
+    dated, *interval = (date_of(known.utc_ns(day)) for day in days)
+    return [dated, repr(date.standard_uncertainty), *interval]
 
 
 def lines(one: SensorPast) -> Iterator[str]:
@@ -147,8 +222,8 @@ def lines(one: SensorPast) -> Iterator[str]:
         cells = [plus_minus(value, expanded) if known_ else "not known" for value, expanded, known_ in told]
         rows.append([date_of(known.utc_ns(day)), str(windows), *cells, "-" if own is None else str(own[1])])
     yield from aligned(rows)
-    for change in past.changes:
-        yield f"{date_of(known.utc_ns(change.day))}  {_words(change, shown.factors, k)}"
+    for change, date in zip(past.changes, one.dates, strict=True):
+        yield f"{date_of(known.utc_ns(change.day))}  {_words(change, shown.factors, k)}; {_when(known, date)}"
 
 
 def _words(change: Change, factors: Array, k: float) -> str:
@@ -159,3 +234,11 @@ def _words(change: Change, factors: Array, k: float) -> str:
     others = [key for key in change.stated if key not in PARAMETERS]
     said = [f"changed by {', '.join(moved)}"] if moved else []
     return "; ".join([*said, *([f"may have changed: {', '.join(others)}"] if others else [])])
+
+
+def _when(known: KnownPast, date: Date) -> str:
+    """When a change came, for people."""
+    first, last = (date_of(known.utc_ns(day)) for day in date.interval)
+    u = rounded(date.standard_uncertainty)
+    told = "" if date.by_windows else ", between the windows before and after the statement"
+    return f"it came {date_of(known.utc_ns(date.day))} with u = {u} d, from {first} to {last} (95 %){told}"

@@ -258,7 +258,7 @@ def steps_of(path: Path, faults: list[str]) -> Iterator[Step]:
     if reader.fault is not None:
         if reader.fault.kind == "corrupt":
             raise ExportError(f"{path}: damaged at {reader.fault}; `fieldcal audit {path}` says more")
-        faults.append(f"{path}: ends early, at {reader.fault}; the samples before this place are exported")
+        faults.append(f"{path}: ends early, at {reader.fault}; what stands before this place is used")
 
 
 def sensors_of(path: Path) -> list[str]:

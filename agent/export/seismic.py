@@ -32,11 +32,10 @@ def write_mseed(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
                 f"{path}: MiniSEED needs ObsPy; install it with: fieldcal extras --install seismic"
             ) from None
         rows, rate_hz = 0, 0.0
-        station = re.sub("[^A-Z0-9]", "", content.device.upper())[:5] or "FIELD"
+        station = station_code(content.device)
         with new_file(path) as file:
             for block in blocks:
-                rate_hz = rate_hz or float(np.float32(block.rate_hz))  # as precise as a record has it
-                code = next(letter for least_hz, letter in BANDS if rate_hz >= least_hz)
+                rate_hz = rate_hz or rate_of(block)
                 about = {
                     "network": NETWORK, "station": station, "sampling_rate": rate_hz,
                     "starttime": UTCDateTime(ns=int(block.t_utc_ns[0])),
@@ -44,8 +43,24 @@ def write_mseed(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
                 stream = Stream()
                 for k, values in enumerate(columns(content, block).T):
                     location = INDICATION if k < content.axes else ACCELERATION
-                    names = {"location": location, "channel": f"{code}N{k % content.axes + 1}"}
+                    names = {"location": location, "channel": channel_code(rate_hz, k % content.axes)}
                     stream.append(Trace(np.ascontiguousarray(values), about | names))
                 stream.write(file, format="MSEED", encoding="FLOAT64", reclen=512)
                 rows += len(block.values)
     return rows
+
+
+def rate_of(block: Samples) -> float:
+    """The rate in Hz, as precise as a record of MiniSEED has it."""
+    return float(np.float32(block.rate_hz))
+
+
+def station_code(device: str) -> str:
+    """The station of a device: the letters and digits of its name, five at most."""
+    return re.sub("[^A-Z0-9]", "", device.upper())[:5] or "FIELD"
+
+
+def channel_code(rate_hz: float, axis: int) -> str:
+    """The channel of an axis (from 0 on) of an accelerometer with this rate."""
+    code = next(letter for least_hz, letter in BANDS if rate_hz >= least_hz)
+    return f"{code}N{axis + 1}"

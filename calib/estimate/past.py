@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.estimate.correction import Law
+from calib.estimate.dating import Date
 from calib.model import Array
 from calib.signal.order_statistics import distinct
 
@@ -21,13 +22,14 @@ class Change:
     """What was stated to change at once on a day: a step, a remount, a calibration that an operator put in force.
 
     `stated`: standard uncertainties of the changes beforehand, by unknown. `found` and `standard_uncertainty` (12,): by
-    how much S and Q changed, by all windows.
+    how much S and Q changed, by all windows. `dated` tells when it came; it may take some seconds, the first time.
     """
 
     day: float
     stated: Mapping[str, float]
     found: Array
     standard_uncertainty: Array
+    dated: Callable[[], Date]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Self
 
 import numpy as np
 
 from calib.estimate.correction import Law
+from calib.estimate.dating import Date, found_date, stated_date
 from calib.estimate.determined import Flags, determined
 from calib.estimate.estimate import Estimate, Now, Then, estimate
 from calib.estimate.innovation import Innovation
@@ -383,9 +384,20 @@ class State:
         for then, after in zip(whole.past(), [np.inf, *reversed(days)], strict=False):
             laws.append(self._law(then.now, *self._values_of(then.now)))
             if after in stated:
-                changes.append(Change(after, stated[after], *self._change_of(then)))
+                dated = self._dated_by(whole, then, after, [begin, *stated, days[-1]])
+                changes.append(Change(after, stated[after], *self._change_of(then), dated))
         windows = [counts[day] for day in days]
         return Past(whole.days, laws[::-1], windows, changes[::-1], begin, self.coverage_factor)
+
+    def _dated_by(self, whole: Estimate, then: Then, day: float, known: Sequence[float]) -> Callable[[], Date]:
+        """What tells when the change on a day, just after `then`, came: if windows showed it, all of them, between the
+        changes before and after it. `known`: the days of the first window, of all changes, and of the last window."""
+        keys = {key for step in self._steps if step.day == day for key in step.u if key in then.now}
+        kinds = [then.now.quantities[then.now.index(key)].kind for key in keys]
+        if all("remount" in kind.loosened_by for kind in kinds) or any(own.day == day for own in self._dated):
+            return partial(stated_date, whole.records, day)
+        begin, end = max(d for d in known if d < day), min((d for d in known if d > day), default=day)
+        return cache(partial(found_date, whole, then, day, begin, end))
 
     def budget(self, whole: Estimate | None = None) -> Sources:
         """What makes U of S and Q by a solution of the whole; None: it is solved anew."""

@@ -10,25 +10,29 @@ from calib.estimate.nuisances import Priors
 from calib.estimate.past import FURTHEST_DAYS, REACH_DAYS, Past
 from calib.estimate.record import Record
 from calib.estimate.state import State
+from calib.estimate.statements import Step
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.model import PARAMETERS, Array
+from calib.model import PARAMETERS, Array, Pose
 from tests.building_windows import building_window
 from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE
+from tests.drawn_records import UP, Truth, template, told
 from tests.unit.test_estimate import MEAN, STILL, U
 
 DAYS = (0.0, 1.0, 2.5, 2.6, 17.0, 18.0, 18.5)
 WALKS = {"sensitivity": 2e-3, "offset_mps2": 0.02, "offset_rate_mps2": 1e-3}
+LEVEL = np.append(np.eye(3).ravel(), np.zeros(3))
+PLACE = Pose("beside", np.eye(3), UP)
 U_STEP, STEP_DAY = 0.1, float(np.nextafter(DAYS[3], np.inf))
 
 
-def filled(seed: int, *, fixed: bool = False, stepped: str = "Syy") -> State:
-    """An element of S steps by 3 % of S_yy between the fourth and the fifth window."""
+def filled(seed: int, *, fixed: bool = False, stepped: str = "Syy", step: float = 0.03) -> State:
+    """An element of S steps by so much of S_yy between the fourth and the fifth window."""
     random, S = np.random.default_rng(seed), S_TRUE.copy()
     wander = Wander(dict(STILL.values) | WALKS)
     state = State(MEAN, U, Priors(), wander, TemperatureModel(), fixed=fixed)
     for k, day in enumerate(DAYS):
         if k == 4:
-            S[np.unravel_index(PARAMETERS.index(stepped), (3, 3))] += 0.03 * S_TRUE[1, 1]
+            S[np.unravel_index(PARAMETERS.index(stepped), (3, 3))] += step * S_TRUE[1, 1]
             state.step({stepped: U_STEP})
         state.update(Record.of(building_window(random, level_mps2=(0.1, 0.1, 0.1), S=S), day))
     return state
@@ -37,9 +41,11 @@ def filled(seed: int, *, fixed: bool = False, stepped: str = "Syy") -> State:
 class Dense:
     """One problem whose unknowns are S and Q at every epoch, the step, and all constants. The rows of windows are those
     of the estimate; priors, walks, rates and the step are written down here by themselves. `values` (K, 12),
-    `covariance` (K, 12, 12); `step` in its own standard uncertainty, with `u_step`."""
+    `covariance` (K, 12, 12); `step` in its own standard uncertainty, with `u_step`. `cost`: chi-squared and the
+    logarithm of the determinant."""
 
-    def __init__(self, whole: Estimate) -> None:
+    def __init__(self, whole: Estimate, step_day: float = STEP_DAY, stated_u: float = U_STEP) -> None:
+        self._step_day, self._stated_u = step_day, stated_u
         self._rows: list[Array] = []
         self.days, keys = whole.days.tolist(), list(whole.unknowns.at)
         self._constants = {key: 12 * len(self.days) + n for n, key in enumerate(keys[12:])}
@@ -61,6 +67,8 @@ class Dense:
         covariance, count = factor @ factor.T, 12 * len(self.days)
         self.values = found[:count].reshape(-1, 12)
         self.covariance = np.array([covariance[k : k + 12, k : k + 12] for k in range(0, count, 12)])
+        triangle = np.linalg.qr(table, mode="r")
+        self.cost = float(triangle[-1, -1] ** 2 + 2.0 * np.log(np.abs(triangle.diagonal()[:-1])).sum())
         self.step, self.u_step = found[self._step], np.sqrt(covariance[self._step, self._step])
 
     def _row(self, columns: dict[int, float], seen: float, u: float) -> None:
@@ -81,7 +89,8 @@ class Dense:
         if centre is not None:
             columns[centre] = -(1.0 - kept)
         if name == "Syy":
-            columns[self._step] = -U_STEP * (float(before < STEP_DAY <= after) + (1.0 - kept) * (before >= STEP_DAY))
+            moved = float(before < self._step_day <= after) + (1.0 - kept) * (before >= self._step_day)
+            columns[self._step] = -self._stated_u * moved
         seen = 0.0 if centre is not None else (1.0 - kept) * MEAN[n]
         self._row(columns, seen, max(U[n] * np.sqrt(1.0 - kept**2), 1e-10))
 
@@ -100,6 +109,71 @@ def test_it_is_the_solution_of_one_dense_problem() -> None:
     assert change.found[4] == pytest.approx(U_STEP * dense.step, rel=1e-5)
     assert change.standard_uncertainty[4] == pytest.approx(U_STEP * dense.u_step, rel=1e-4)
     assert change.found[4] == pytest.approx(0.03 * S_TRUE[1, 1], abs=3.0 * change.standard_uncertainty[4])
+
+
+def test_the_date_of_a_step_is_that_of_the_dense_problem_with_the_step_in_each_gap() -> None:
+    """The step, as large as it was found to be, is as likely beforehand at any time; at 1 % it is in doubt."""
+    state = filled(1, step=0.01)
+    past = state.past()
+    (change,), whole = past.changes, state.estimate(also=past.days.tolist())
+    edges, size = np.array(DAYS), abs(float(change.found[4]))
+    costs = np.array([Dense(whole, float(np.nextafter(day, -np.inf)), size).cost for day in DAYS[1:]])
+    share = np.diff(edges) * np.exp(-0.5 * (costs - costs.min()))
+    share /= share.sum()
+    assert share.max() < 0.95  # so that both ends of the interval are in other gaps
+    even = np.random.default_rng(1).permutation((np.arange(100_000) + 0.5) / 100_000)  # quantiles of the mixture
+    days = np.interp(even, np.append(0.0, np.cumsum(share)), edges)
+    date = change.dated()
+    assert date.by_windows
+    np.testing.assert_allclose([date.day, *date.interval], [days.mean(), *np.quantile(days, [0.025, 0.975])], atol=2e-3)
+    assert date.standard_uncertainty == pytest.approx(days.std(), rel=1e-3)
+
+
+def test_a_step_within_merged_windows_is_dated_to_them_and_no_closer() -> None:
+    """Four windows a day; the step is found a week later, when whole days were merged. Its share of the day's windows
+    does not tell the hour, for nobody knows how they were spread."""
+    days, day = np.arange(0.0, 40.0, 0.25), 14.6
+    wander, priors = Wander(dict(STILL.values) | {"sensitivity": 1e-6}), Priors(offset_mps2=1e-3)
+    state, window = State(LEVEL, U, priors, wander, TemperatureModel(), fixed=True), template(PLACE, noise=0.05)
+    S = [np.eye(3) + np.diag([0.0, 0.02 * (t >= day), 0.0]) for t in days.tolist()]
+    records = [told(window, Truth(own, np.zeros(3)), t) for own, t in zip(S, days.tolist(), strict=True)]
+    found = float(np.nextafter(days[86], -np.inf))
+    state.take_also(records, [Step(found, {"Syy": U_STEP})])
+    state.merge_old(float(days[-1]))
+    (change,) = state.past().changes
+    assert change.day == found
+    date = change.dated()
+    np.testing.assert_allclose(date.interval, [14.0 + 0.025 * 0.75, 14.75 - 0.025 * 0.75], rtol=0, atol=1e-3)
+    assert date.standard_uncertainty == pytest.approx(0.75 / np.sqrt(12.0), rel=1e-3)
+
+
+@pytest.mark.parametrize(("every", "last"), [(0.5, 19.0), (0.5, 29.5), (5.0, 40.0)])
+def test_the_date_of_a_found_drift_is_its_onset(every: float, last: float) -> None:
+    """A drift by 0.3 % a day, found on day 19. A window tells S to 0.13 %, so the onset to half a day, also between two
+    windows that are five days apart, and where no window came since it was found."""
+    days, day = np.arange(0.0, last + every, every), 12.2
+    wander, priors = Wander(dict(STILL.values) | {"sensitivity": 1e-6}), Priors(offset_mps2=1e-3)
+    state, window = State(LEVEL, U, priors, wander, TemperatureModel(), fixed=True), template(PLACE, noise=0.05)
+    S = [np.eye(3) + np.diag([0.0, 3e-3 * max(t - day, 0.0), 0.0]) for t in days.tolist()]
+    records = [told(window, Truth(own, np.zeros(3)), t) for own, t in zip(S, days.tolist(), strict=True)]
+    state.take_also(records, [Step(float(np.nextafter(19.0, np.inf)), {"Syy": 0.02, "Syy_rate": 3e-3})])
+    (change,) = state.past().changes
+    date = change.dated()
+    assert date.interval[0] < day < date.interval[1]
+    assert date.day == pytest.approx(day, abs=2.0 * date.standard_uncertainty)
+    assert 0.1 < date.standard_uncertainty < 0.7
+
+
+def test_the_date_of_a_stated_change_is_between_the_windows_before_and_after_it() -> None:
+    state = filled(7)
+    state.remount(of_reference=False)
+    state.update(Record.of(building_window(np.random.default_rng(8), level_mps2=(0.1, 0.1, 0.1)), 22.5))
+    change = state.past().changes[-1]
+    assert change.day == np.nextafter(18.5, np.inf)
+    date = change.dated()
+    assert not date.by_windows
+    np.testing.assert_allclose([date.day, *date.interval], [20.5, 18.6, 22.4], rtol=1e-12)
+    assert date.standard_uncertainty == pytest.approx(4.0 / np.sqrt(12.0))
 
 
 def test_epochs_stand_at_windows_on_both_sides_of_a_change_and_within_long_gaps() -> None:

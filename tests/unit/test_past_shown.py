@@ -19,11 +19,12 @@ from agent.core.snapshot import pack, unpack
 from agent.delivery.history import FILE_NAME, History
 from agent.delivery.schema import write_memory
 from agent.delivery.store import Store
-from agent.export.smoothing import Smoothed
+from agent.export.smoothing import Smoothed, date_of
 from agent.report.material import gather
 from calib.estimate.correction import Law
 from calib.estimate.past import Past
 from calib.model import PARAMETERS
+from calib.rounding import rounded
 from tests.unit.recorded_bench import EPOCH_NS, record
 
 RECORDING = "fieldcal-000001.mcap"
@@ -90,6 +91,58 @@ def test_table_csv_and_json_say_the_same(kept: Path, tmp_path: Path, capsys: pyt
     np.testing.assert_allclose([epoch["t_utc_ns"] for epoch in past["epochs"]], stops, rtol=0, atol=1e6)
 
 
+def test_recordings_tell_the_same_past_as_the_data_directory(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, "show", "--past", kept / RECORDING, "--json", "-")
+    assert (status, err) == (0, "")
+    told = json.loads(out)
+    assert told["recordings"] == [str(kept / RECORDING)]
+    assert told["past"] == [shown(capsys, kept)]
+    (tmp_path / "no.mcap").write_bytes(b"x" * 100)
+    for arguments, words in (
+        ([kept / RECORDING], "recordings tell the past; add --past"),
+        (["--past", kept / RECORDING, "--data-dir", kept], "--data-dir belongs to a data directory; remove it"),
+        (["--past", tmp_path / "no.mcap"], "damaged at byte 0"),
+        (["--past", tmp_path / "none.mcap"], "No such file"),
+    ):
+        status, out, err = run(capsys, "show", *arguments)
+        assert (status, out) == (2, "")
+        assert words in err
+
+
+def test_the_date_of_a_change_is_the_same_in_table_csv_and_json(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A step is stated between the second and the third window, whose ends are 12 s apart."""
+
+    def stepped(state: bytes) -> bytes:
+        held = unpack(state)
+        own = held["estimation"]["state"]
+        day = float(np.nextafter(own["records"][2]["day"], -np.inf))
+        own["steps"].append({"day": day, "u": {"Sxx": 2000.0}})
+        return pack(held)
+
+    change_memory(copied, stepped)
+    past, to = shown(capsys, copied), tmp_path / "past.csv"
+    (change,) = past["changes"]
+    date = change["date"]
+    first, last = date["interval_utc_ns"]
+    assert past["epochs"][0]["t_utc_ns"] <= first < date["t_utc_ns"] < last <= past["epochs"][-1]["t_utc_ns"]
+    assert (date["probability"], date["told_by"]) == (0.95, "windows")
+    assert run(capsys, "show", "--past", "--data-dir", copied, "--csv", to)[0] == 0
+    head, *rows = csv.reader(line for line in to.read_text().splitlines() if not line.startswith("#"))
+    dated = [dict(zip(head, row, strict=True)) for row in rows if row[head.index("change")]]
+    (row,) = dated
+    times = [date_of(t) for t in (date["t_utc_ns"], first, last)]
+    assert [row[name] for name in ("change", "change_after", "change_before")] == times
+    assert float(row["u_change_days"]) == date["standard_uncertainty_days"]
+    assert row["time"] == date_of(change["t_utc_ns"])
+    line = run(capsys, "show", "--past", "--data-dir", copied)[1].splitlines()[-1]
+    u = rounded(date["standard_uncertainty_days"])
+    assert line.endswith(f"; it came {times[0]} with u = {u} d, from {times[1]} to {times[2]} (95 %)")
+
+
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     ending: str, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -125,12 +178,52 @@ def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     assert set(columns["calibration"].tolist()) == {0, *found.values()}
 
 
+def test_stationxml_has_the_channels_of_the_miniseed_of_the_same_recording(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """ObsPy takes the sensitivity of each trace from the StationXML; the same numbers as in the past."""
+    obspy = pytest.importorskip("obspy", reason="ObsPy is not installed (extra seismic)")
+    from obspy.io.stationxml.core import validate_stationxml
+
+    place = ["--place", "47.5", "-8.25", "412"]
+
+    def export(name: str, *more: str | Path) -> tuple[int, str, str]:
+        return run(capsys, "export", kept / RECORDING, "-o", tmp_path / name, *more)
+
+    assert export("a.mseed")[0] == 0
+    for name, more in (("a.xml", []), ("b.xml", []), ("c.xml", ["--data-dir", kept])):
+        assert export(name, "--corrected", *place, *more)[::2] == (0, "")
+    first, again, by_store = ((tmp_path / f"{name}.xml").read_bytes() for name in "abc")
+    assert first == again == by_store
+    assert validate_stationxml(str(tmp_path / "a.xml")) == (True, ())
+    past, inventory = shown(capsys, kept), obspy.read_inventory(tmp_path / "a.xml")
+    traces = obspy.read(tmp_path / "a.mseed").select(location="00")
+    traces.trim(obspy.UTCDateTime(ns=past["epochs"][-1]["t_utc_ns"]))
+    assert len(traces) == 3
+    for trace in traces:
+        told = inventory.get_response(trace.id, trace.stats.starttime).instrument_sensitivity
+        k = int(trace.stats.channel[-1]) - 1
+        assert told.value == past["epochs"][-1]["sensitivity"][k][k]
+        assert told.frequency == past["reference_frequency_hz"]
+    for name, arguments, words in (
+        ("no.xml", ["--corrected"], "StationXML wants the place of the sensor; add --place"),
+        ("no.xml", place, "StationXML has the epochs of the past; add --corrected"),
+        ("no.xml", ["--corrected", "--place", "91", "0", "0"], "91.0 is not in the range"),
+        ("no.xml", ["--corrected", "--place", "nan", "0", "0"], "is not a finite number"),
+        ("no.csv", place, "--place belongs to StationXML"),
+    ):
+        status, _, err = export(name, *arguments)
+        assert status == 2
+        assert words in err
+        assert not (tmp_path / name).exists()
+
+
 def test_samples_between_two_epochs_are_corrected_by_what_is_between_their_values() -> None:
     """S grows by 2 % and Q by 1 m/s2 in a day; S and Q depend on the temperature as well."""
     sides = ((1.0, 0.0), (1.02, 1.0))
     laws = [Law(np.append(size * np.eye(3).ravel(), [Q] * 3 + [0.1] * 3), np.eye(15), 1) for size, Q in sides]
     past = Past(np.array([5.0, 6.0]), laws, (1, 1), (), 5.0, 2.0)
-    known = KnownPast("mems", "mems A", "A", "m/s2", past, "", 6.0, EPOCH_NS)
+    known = KnownPast("mems", "mems A", "A", "m/s2", past, "", 0.0, 6.0, EPOCH_NS)
     smoothed, hour_ns = Smoothed({"A": known}, {"B": "B has none"}), 3600 * 10**9
     V = np.array([[2.02, 1.01, 0.0]])
     a, why = smoothed.acceleration("A", V, EPOCH_NS - 12 * hour_ns, 22.0)
@@ -190,6 +283,20 @@ def test_a_store_without_a_state_and_a_state_of_an_earlier_version_are_told(
     assert not to.exists()
 
 
+@pytest.mark.parametrize("u", [np.nan, -1.0, 1e300])
+def test_a_step_of_no_size_is_one_line(u: float, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def stepped(state: bytes) -> bytes:
+        held = unpack(state)
+        own = held["estimation"]["state"]
+        own["steps"].append({"day": float(np.nextafter(own["records"][2]["day"], -np.inf)), "u": {"Sxx": u}})
+        return pack(held)
+
+    change_memory(copied, stepped)
+    status, out, err = run(capsys, "show", "--past", "--data-dir", copied)
+    assert (status, err) == (0, "")
+    assert "its state cannot be read" in out or "; it came " in out.splitlines()[-1]
+
+
 @pytest.mark.parametrize("damage", ["bytes", "content", "page"])
 def test_a_damaged_state_is_one_line(damage: str, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if damage == "bytes":
@@ -238,6 +345,45 @@ def test_what_cannot_be_corrected_is_refused_with_a_remedy(
     status, _, err = run(capsys, "export", kept / RECORDING, "-o", to, "--data-dir", kept)
     assert status == 2
     assert "--data-dir names the windows for --corrected" in err
+
+
+def test_what_makes_u_of_any_calibration_is_told_by_store_and_recording(
+    kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of an earlier one, the numbers are those of the run that ended with it."""
+
+    def budget(number: int, *of: str | Path) -> dict[str, Any]:
+        status, out, err = run(capsys, "show", "--budget", str(number), *of, "--json", "-")
+        assert (status, err) == (0, "")
+        told = dict(json.loads(out))
+        assert told["sequence"] == number
+        np.testing.assert_allclose(told["u_over_u_in_force"], 1.0, rtol=0, atol=0.01)
+        return dict(told["budget"])
+
+    def newest(directory: Path) -> dict[str, Any]:
+        return dict(json.loads(run(capsys, "show", "--data-dir", directory, "--json", "-")[1])["sensors"]["mems"])
+
+    record(tmp_path / "shorter", 45.0)
+    for ended in (kept, tmp_path / "shorter"):
+        told = newest(ended)
+        for of in (["--data-dir", kept], [kept / RECORDING]):
+            assert budget(told["calibration"]["sequence"], *of) == told["budget"]
+    third = told["calibration"]["sequence"]
+    assert third < newest(kept)["calibration"]["sequence"]
+    lines = run(capsys, "show", "--budget", str(third), kept / RECORDING)[1].splitlines()
+    assert lines[0].startswith(f"mems: calibration {third} of run run-1, in force since 2026-09-21")
+    assert len(lines) == 3 + len(told["budget"]["standard_uncertainty"])
+    gone = shutil.copytree(kept, tmp_path / "gone")
+    (gone / RECORDING).unlink()
+    for arguments, status, words in (
+        (["1", kept / RECORDING], 2, "has no calibration with the number 1"),
+        (["1", "--data-dir", kept], 2, "no calibration with the number 1 is kept"),
+        ([str(third), "--data-dir", gone], 3, "the recording fieldcal-000001.mcap does not exist any more"),
+        ([str(third), "--past"], 2, "--past and --budget show different things"),
+    ):
+        found, out, err = run(capsys, "show", "--budget", *arguments)
+        assert (found, out) == (status, "")
+        assert words in err
 
 
 def test_show_and_report_say_what_makes_u(kept: Path, copied: Path, capsys: pytest.CaptureFixture[str]) -> None:
