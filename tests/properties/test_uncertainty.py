@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from calib.estimate.statements import Dated, Statements, Step
 from calib.estimate.thinning import merged
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Array, Pose
+from calib.signal.response import ResponseModel
 from tests.clamp_windows import G_MPS2, frame
 from tests.drawn_records import UP, Truth, scatter, template, told
 
@@ -63,7 +65,7 @@ class World:
     records: Sequence[Record]
     now: Mapping[str, float]
     u: tuple[float, float]
-    priors: Mapping[str, float] = field(default_factory=dict)
+    priors: Mapping[str, Any] = field(default_factory=dict)
     walks: Mapping[str, float] = field(default_factory=dict)
     temperature: TemperatureModel = field(default_factory=TemperatureModel)
     until: float | None = None
@@ -71,7 +73,7 @@ class World:
 
     def solved(self) -> Now:
         mean, u = np.append(S0.ravel(), Q0), np.append(np.full(9, self.u[0]), np.full(3, self.u[1])) * SCALE
-        priors = {"": Priors.none().with_values(self.priors)}
+        priors = {"": replace(Priors.none(), **self.priors)}
         stated = Statements(mean, u, priors, Wander(STILL | self.walks), self.temperature, **self.more)  # type: ignore[arg-type]
         now = estimate(self.records, stated).now
         return now if self.until is None else now.passed_to(self.until)
@@ -499,16 +501,17 @@ def motion_ahead_that_one_axis_does_not_measure(draw: Drawn) -> World:
 def the_response_between_motion_and_gravity(draw: Drawn) -> World:
     """ln h = sum of c_k (i omega)^k. S holds at 5 Hz; gravity sees S / |h(5 Hz)|, of which a fifth is the reference's,
     and of the sensor's known filters 0.1 of ln |h|."""
-    u, priors = (1e-4, 50.0), Priors.none().with_response((1.0, 8.0)).values
+    u = 1e-4, 50.0
     S, Q = s_and_q(draw, u)
-    stated_by = priors | {"response": 0.02, "reference_frequency_hz": 5.0, "reference_share": 0.2, "known_size": 0.1}
+    stated_by = {"response": 0.02, "reference_frequency_hz": 5.0, "reference_share": 0.2, "known_size": 0.1}
     powers = np.arange(2, 7)
     terms = 0.02 / (powers * (2.0 * np.pi * 8.0) ** powers) * draw("response", 5)
     log_h = float((terms * (2.0j * np.pi * 5.0) ** powers).sum().real)
     at_0hz = S * np.exp(-0.8 * log_h - 0.1)
     own = replace(told(BESIDE, Truth(S, Q), 0.0), means=(at_0hz @ UP + Q)[None])
     still = replace(own, root=0.0 * own.root, slopes=0.0 * own.slopes, passed=0.0 * own.passed)
-    return World("response", each("Qz"), [still], values(S, Q), u, stated_by)
+    model = {"response_model": ResponseModel(8.0)}
+    return World("response", each("Qz"), [still], values(S, Q), u, stated_by | model)
 
 
 @case

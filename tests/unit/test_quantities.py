@@ -9,11 +9,20 @@ import pytest
 
 from agent.calibrate.stated import options_of
 from agent.cli.calibrate import calibrate
-from agent.config.knowledge import AT_FIXED_MOUNT, Certificate, Knowledge, Prior, Process, Setting, Uncertainty
+from agent.config.knowledge import (
+    AT_FIXED_MOUNT,
+    Certificate,
+    Knowledge,
+    Prior,
+    Process,
+    Setting,
+    Temperature,
+    Uncertainty,
+)
 from agent.config.knowledge import WALKS as WALKS_STATED
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import KINDS, WALKS
-from calib.estimate.wander import Wander
+from calib.estimate.wander import TemperatureModel, Wander
 from calib.recorded.options import STATED as BY_OPTION
 from calib.recorded.priors import priors_of
 
@@ -74,6 +83,10 @@ def test_walks_of_a_channel() -> None:
         "tilt_rad": 0.006 * DEG, "reference_drift": 0.006 / 365.25**0.5,
     }  # fmt: skip
     assert STATED.wander().values == pytest.approx(expected)
+
+
+def test_where_no_temperature_is_stated_it_is_20_degc_for_files_and_streams() -> None:
+    assert Temperature().model.reference_degc == TemperatureModel().reference_degc == 20.0
 
 
 def test_every_number_that_the_configuration_may_state_is_tried_here() -> None:

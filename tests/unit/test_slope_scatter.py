@@ -8,7 +8,10 @@ import pytest
 from calib.distributions import chi2_quantile
 from calib.estimate import adjustment
 from calib.estimate.adjustment import Adjustment, adjust
+from calib.estimate.condense import condense
 from calib.estimate.nuisances import Priors
+from calib.estimate.slope_scatter import SlopeScatter, estimated
+from calib.excitation.excited import excited
 from calib.excitation.sums import window_sums
 from calib.geometry import clamp
 from calib.model import Array, Window
@@ -84,6 +87,29 @@ def test_s_and_q_are_as_uncertain_as_said(jitter_s: float) -> None:
 def test_weighed_as_exact_they_would_not_be(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adjustment, "SCATTER_TURNS", 0)
     assert mean_square(100e-6).max() > 4.0
+
+
+def test_loadings_are_the_size_of_motion_and_its_rate_over_the_noise() -> None:
+    """The mean square of the motion is 2^2 / 2 for each tone, that of its rate omega^2 times as much. The slopes grow
+    in proportion to the motion that is shown; a lag takes so much of them from the slope on the rate."""
+    own = windows(np.random.default_rng(SEED), 0.0)
+    data = condense([excited(w) for w in own])
+    found, shown = SlopeScatter.of(data), np.array([w.pose.direction[:, 0] @ S_TRUE.T for w in own])
+    size = np.sqrt(RATE_HZ * SECONDS * 2.0 * np.array([4.0, np.sum((2.0 * np.pi * FREQUENCIES_HZ) ** 2)]))
+    signal, lag = (loading.reshape(len(own), 2, 3) for loading in (found.signal, found.lag))
+    np.testing.assert_allclose(signal[:, 0] * data.type_a.noise / size[0], shown, rtol=0, atol=0.1)
+    np.testing.assert_allclose(lag[:, 1] * data.type_a.noise / size[1], -shown, rtol=0, atol=0.1)
+
+
+def test_the_scatter_of_lags_is_what_residuals_show_beyond_noise() -> None:
+    """Forty windows whose loading is 2, and who are weighed for a scatter of 1/2: residuals of 3 are then twice their
+    square of before, which is 18. Noise has the variance 2, and a quarter of each was spent on what was adjusted."""
+    along = np.eye(1, 6).repeat(40, axis=0)
+    nothing = np.zeros((40, 6))
+    stated = SlopeScatter(np.full(40, 0.5), 2.0 * along, np.zeros(40), nothing)
+    found = estimated(stated, 3.0 * along, 0.5 * along[..., None], 2.0 * np.eye(6))
+    assert found.degrees_of_freedom == pytest.approx(30.0, rel=1e-12)
+    np.testing.assert_allclose(found.lag_s, np.sqrt((40 * 18.0 - 30 * 2.0) / (30 * 2.0**2)), rtol=1e-12)
 
 
 def test_the_scatter_found_is_that_put_in() -> None:

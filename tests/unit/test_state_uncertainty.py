@@ -19,6 +19,7 @@ from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Calibration, Pose
 from calib.signal.known_response import known_of
+from calib.signal.response import FLAT
 from tests.clamp_windows import G_MPS2
 from tests.drawn_records import UP, Truth, template, told
 
@@ -170,6 +171,28 @@ def test_half_of_the_time_of_a_widened_walk_adds_half_of_its_variance() -> None:
         )
         variances.append(estimate([record(), record(AT_REST, 5.0)], stated).now.variance[:9])
     np.testing.assert_allclose(variances[1] - variances[0], np.append(0.5 * 0.02**2, np.zeros(8)), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(("left", "is_taken_out"), [(0.0029, True), (0.0031, False)])
+def test_a_response_is_taken_out_if_less_than_0_3_per_cent_is_left_at_the_end_of_the_motion(
+    left: float, is_taken_out: bool
+) -> None:
+    """Its terms are in units of those of a low-pass filter a tenth above the end of the motion: (i f / f0)^k / k."""
+    size = abs(sum((1.0j / 1.1) ** k / k for k in range(2, 7)))
+    over = OverFrequency(motion_hz=(1.0, 8.0), settled_hz=3.0)
+    priors = over.stated(Priors.none()).with_values({"response": 1e-9, "response_at": left / size})
+    now = estimate([record()], Statements(MEAN, U, {"": priors}, Wander(STILL), TemperatureModel())).now
+    assert over.is_taken_out(FLAT, now, "A") == is_taken_out
+
+
+@pytest.mark.parametrize(
+    ("octaves", "is_another"), [((0.9, 0.3), False), ((-0.9, -0.3), False), ((1.1, 0.0), True), ((0.0, 0.37), True)]
+)
+def test_the_band_is_another_one_octave_below_or_a_third_above(octaves: tuple[float, float], is_another: bool) -> None:
+    low_hz, high_hz = (float(hz * 2.0**by) for hz, by in zip((1.0, 8.0), octaves, strict=True))
+    moving = replace(BESIDE, motion_hz=(low_hz, high_hz), mean_hz=2.0)
+    found = OverFrequency(motion_hz=(1.0, 8.0), first_hz=2.0).begun(moving, [])
+    assert found.motion_hz == ((low_hz, high_hz) if is_another else (1.0, 8.0))
 
 
 def test_what_known_filters_leave_open_is_in_the_uncertainty_of_s() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,6 +60,31 @@ def test_a_drift_is_told_when_its_net_change_is_beyond_what_the_walk_allows(sds_
     assert verdict.change == pytest.approx(sds_a_day * WALK * day, rel=1e-9)
     assert verdict.u_change == pytest.approx(WALK * np.sqrt(day), rel=1e-9)
     assert "sensor or reference" in verdict.reason
+
+
+def test_the_error_of_a_rate_counts_over_the_whole_span() -> None:
+    """The covariance with the rate is half of the walk's variance a day: 2 L of it is as much as the walk over L."""
+    walks = Walks(RATE)
+    course = [
+        replace(seen(day, value, "A"), with_rate=0.5 * WALK**2 * ONES) for day, value in enumerate(ramp(60, WALK))
+    ]
+    day, verdict = next((shown.day, found) for shown in course for found in walks.update({"A": shown}))
+    assert day == np.ceil(4.0 * THRESHOLD)
+    assert verdict.u_change == pytest.approx(WALK * np.sqrt(2.0 * day), rel=1e-9)
+
+
+@pytest.mark.parametrize(("begins", "cause"), [(5, "sensor, because B"), (7, "sensor or reference")])
+def test_another_reference_tells_who_has_drifted_if_it_was_there_for_three_quarters_of_the_time(
+    begins: int, cause: str
+) -> None:
+    walks, values = Walks(RATE), ramp(40, WALK)
+    for day, value in enumerate(values):
+        there = ("A", "B") if day >= begins else ("A",)
+        if found := walks.update({name: seen(day, value, name) for name in there}):
+            assert 20 < day < 26  # a quarter of it is between 5 and 7 days
+            assert cause in found[0].reason
+            return
+    raise AssertionError("nothing was told")
 
 
 def test_walks_as_they_are_stated_are_told_at_most_as_often_as_the_formula_says() -> None:
