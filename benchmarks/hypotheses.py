@@ -5,6 +5,9 @@
 Windows of both references take turns. A window that contradicts the state is held; five held ones are judged as the
 agent does it (agent/core/hypotheses.py). Right: the device is named. Wrong: another one is. Undecided: neither, or
 fewer than five windows contradict within the thirty after the step, which is then a change that U covers.
+
+And what does a change look like, twelve windows after it, beside one reference? Right: its shape is told, alone or with
+others that fit alike. Wrong: another shape alone.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.core.hypotheses import Devices, confirmed
+from agent.core.hypotheses import Devices, confirmed, shape_of_change
 from benchmarks.page import machine, write_part
 from calib.distributions import chi2_quantile
 from calib.estimate.nuisances import Priors
@@ -33,6 +36,11 @@ from tests.building_windows import building_window
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 SIZES, KINDS = (0.003, 0.005, 0.01, 0.03), ("sensor", "reference in use", "check reference", "mount")
 BEFORE, AFTER, HELD, LEVEL = 20, 30, 5, (0.3, 0.3, 0.3)
+WEAK, SINCE = (0.03, 0.03, 0.03), 12  # motion of a bridge on a calm day, and windows since a change
+SHAPES = {  # and what tells them
+    "turn": "a turn of the sensor", "one output": "output y of the sensor", "all outputs": "all outputs",
+    "one element": "", "nothing": "",
+}  # fmt: skip
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.02, 0.01), np.full(3, 0.5))
 TURNS = "ABBABAABBAABABBA"  # Thue and Morse
@@ -82,6 +90,41 @@ def verdict(kind: str, size: float, seed: int) -> str:
     return "undecided"
 
 
+def shape(kind: str, size: float, seed: int) -> str:
+    """What the agent says of the shape of a change: right, alike, wrong or none."""
+    random = np.random.default_rng([seed, list(SHAPES).index(kind), round(size * 1e4)])
+    state = State(MEAN, U, PRIORS, Wander(), TemperatureModel(), fixed=True)
+    state.meet("A")
+    error, S, axis = 1e-3 * random.standard_normal(3), np.eye(3) + 0.01 * random.standard_normal((3, 3)), 1
+    way = random.standard_normal(3)
+    after = {
+        "turn": S @ rotation(way / np.linalg.norm(way), size), "one output": S + size * np.diag(np.eye(3)[axis]) @ S,
+        "all outputs": S * (1.0 + size), "one element": S + size * np.outer(np.eye(3)[0], np.eye(3)[2]), "nothing": S,
+    }[kind]  # fmt: skip
+    for k in range(BEFORE + SINCE):
+        window = building_window(random, level_mps2=WEAK, S=S if k < BEFORE else after, reference_error=error)
+        state.update(Record.of(window, k / 24.0, reference="A", to_hz=state.motion_to_hz))
+    told = shape_of_change(state, BEFORE / 24.0, np.eye(3), limit)
+    if not told or SHAPES[kind] not in told or not SHAPES[kind]:
+        return "wrong" if told else "none"
+    return "right" if " or " not in told else "alike"
+
+
+def shapes(seeds: Sequence[int]) -> str:
+    """A row for each kind of change, a column for each size."""
+    rows = [
+        "| change | " + " | ".join(f"{100 * size:g} %" for size in SIZES) + " |",
+        "| --- " * (len(SIZES) + 1) + "|",
+    ]
+    for kind in SHAPES:
+        found = []
+        for size in SIZES:
+            count = Counter(shape(kind, size, seed) for seed in seeds)
+            found.append(f"{count['right']}, {count['alike']}, {count['wrong']}, {count['none']}")
+        rows.append(f"| {kind} | {' | '.join(found)} |")
+    return "\n".join(rows)
+
+
 def table(seeds: Sequence[int]) -> str:
     """A row for each kind, a column for each size."""
     rows = [
@@ -104,6 +147,8 @@ if __name__ == "__main__":
     given = parser.parse_args()
     text = f"`python -m benchmarks.hypotheses`, {machine()}. Right, wrong, undecided of {given.seeds}.\n\n"
     text += table(range(given.seeds))
+    text += f"\n\nOf a shape: right, as fitting alike, another one, none, of {given.seeds}.\n\n"
+    text += shapes(range(given.seeds))
     if given.write:
         write_part("hypotheses", text, PAGE)
     else:
