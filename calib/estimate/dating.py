@@ -16,7 +16,7 @@ these all times are alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Self
@@ -26,7 +26,7 @@ import numpy as np
 from calib.estimate.chain import Passage
 from calib.estimate.determined import Flags
 from calib.estimate.estimate import Estimate, Then
-from calib.estimate.quantities import ALL_RATES
+from calib.estimate.quantities import ALL_RATES, S_AND_Q
 from calib.estimate.record import Record
 from calib.model import Array
 from calib.signal.order_statistics import distinct
@@ -81,7 +81,8 @@ def found_date(whole: Estimate, then: Then, day: float, begin: float, end: float
     ends = np.array([day for record in whole.records for day in record.days])
     edges = distinct(np.array([begin, end, *ends[(ends > begin) & (ends < end)]]))
     edges = edges[np.append(True, np.diff(edges) > APART_DAYS)]
-    cost = cache(_Supposed(whole, day, _moves(then)).cost)
+    stated = {key: u for step in whole.unknowns.statements.steps if step.day == day for key, u in step.u.items()}
+    cost = cache(_Supposed(whole, day, _moves(then, stated)).cost)
     probability = _probability(cost, edges)
     for _ in range(ROUNDS):
         likely = np.asarray(probability > NEGLIGIBLE * probability.sum())
@@ -109,11 +110,11 @@ def _even_in_merged(records: Sequence[Record], edges: Array, probability: Array)
     return found
 
 
-def _moves(then: Then) -> Array:
+def _moves(then: Then, stated: Mapping[str, float]) -> Array:
     """U (N, m): of a drift each rate that changed, else the change that was found; where nothing was found, since no
-    window came yet, what was stated of each parameter of S and Q."""
-    at, u = then.now.unknowns.at, np.linalg.norm(then.moved_factor, axis=1)
-    rates = [at[name] for name in ALL_RATES if name in at and u[at[name]] > 0.0]
+    window came yet, what was `stated` of each parameter of S and Q."""
+    unknowns, u = then.now.unknowns, np.linalg.norm(then.moved_factor, axis=1)
+    rates = [unknowns.at[name] for name in ALL_RATES if name in stated]
     if rates:
         return np.diag(np.hypot(then.moved, u))[:, rates]
     found = np.abs(then.moved) > SIGNIFICANT * u
@@ -121,7 +122,8 @@ def _moves(then: Then) -> Array:
         return np.where(found, then.moved, 0.0)[:, None]
     if (np.abs(then.moved) > ROUNDING * u).any():
         return then.moved[:, None]
-    return then.moved_factor[:, (then.moved_factor[:12] != 0.0).any(axis=0)]
+    parameters = {quantity.key for quantity in S_AND_Q}
+    return np.array(unknowns.stepped({key: size for key, size in stated.items() if key in parameters})).T
 
 
 def _probability(cost: Callable[[float], float], edges: Array) -> Array:

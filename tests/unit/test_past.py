@@ -133,7 +133,8 @@ def test_a_step_within_merged_windows_is_dated_to_them_and_no_closer() -> None:
     """Four windows a day; the step is found a week later, when whole days were merged. Its share of the day's windows
     does not tell the hour, for nobody knows how they were spread."""
     days, day = np.arange(0.0, 40.0, 0.25), 14.6
-    wander, priors = Wander(dict(STILL.values) | {"sensitivity": 1e-6}), Priors(offset_mps2=1e-3)
+    walks = {"sensitivity": 1e-6, "offset_rate_mps2": 1e-3, "offset_rate_walk_mps2": 2e-5}
+    wander, priors = Wander(dict(STILL.values) | walks), Priors(offset_mps2=1e-3)
     state, window = State(LEVEL, U, priors, wander, TemperatureModel(), fixed=True), template(PLACE, noise=0.05)
     S = [np.eye(3) + np.diag([0.0, 0.02 * (t >= day), 0.0]) for t in days.tolist()]
     records = [told(window, Truth(own, np.zeros(3)), t) for own, t in zip(S, days.tolist(), strict=True)]
