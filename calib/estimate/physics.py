@@ -184,7 +184,8 @@ class Windows:
         w, told = len(p), (self.stack.slopes, self.stack.means)
         slope, mean = ((observed - x).reshape(w, -1) for observed, x in zip(told, self.predicted(p), strict=True))
         d_slope, d_mean = (np.zeros((*left.shape, len(live))) for left in (slope, mean))
-        for part in np.array_split(np.arange(len(live)), -(-len(live) * w // AT_ONCE) or 1):
+        parts = min(-(-len(live) * w // AT_ONCE), len(live)) or 1
+        for part in np.array_split(np.arange(len(live)), parts):
             step = np.zeros((len(part), 1, SIZE), complex)
             step[range(len(part)), 0, live[part]] = 1j * STEP
             for found, x in zip((d_slope, d_mean), self.predicted(near + step), strict=True):

@@ -156,9 +156,8 @@ class Unknowns:
         rate_u, rate_walk = (s.wander.of(w) * s.scale for w in (OFFSET_RATE.prior, OFFSET_RATE.walk))
         for name in ALL_RATES:
             if name in RATES:
-                yield Unknown(
-                    Quantity(name, OFFSET_RATE), 0.0, rate_u or EXACT * s.scale, begin, rate_walk**2, rate_u**2
-                )
+                bound = rate_u**2 or np.inf  # stated to begin at 0, it may still walk
+                yield Unknown(Quantity(name, OFFSET_RATE), 0.0, rate_u or EXACT * s.scale, begin, rate_walk**2, bound)
             elif name in stepping:
                 yield Unknown(Quantity(name, SENSITIVITY_RATE), 0.0, EXACT * s.scale, begin)
         for own, rate in zip(unknowns, ALL_RATES, strict=True):

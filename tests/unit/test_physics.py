@@ -116,6 +116,16 @@ def test_the_derivatives_are_those_of_the_prediction() -> None:
             np.testing.assert_allclose(found[0, :, k] / size, expected / size, rtol=0, atol=1e-4, err_msg=str(k))
 
 
+def test_more_windows_than_are_taken_at_once_have_the_same_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = record(WORLDS["as stated"][1])
+    windows = Windows(Stack.of([own] * 3, fixed=False), 20.0, at_hz=2.0, share=0.3, known_size=0.01)
+    p, live = np.tile(inputs(), (3, 1)), np.array([0, 4, 9])
+    expected = windows.linear(p, p, live)
+    monkeypatch.setattr(physics, "AT_ONCE", 2)
+    for found, before in zip(windows.linear(p, p, live), expected, strict=True):
+        np.testing.assert_array_equal(found, before)
+
+
 @pytest.mark.parametrize("where", [physics.TURN, physics.TURN_GRAVITY])
 def test_a_turn_is_perturbed_from_the_left(where: slice) -> None:
     """So a common turn of all positions stays exactly a turn of S, however far each position is turned."""

@@ -349,3 +349,11 @@ def test_the_law_of_a_later_day_has_wandered_on_and_changes_nothing() -> None:
     rate_u = np.array([found.quantity(name)[1] for name in ("Qx_rate", "Qy_rate", "Qz_rate")])
     np.testing.assert_allclose(grown, 100.0 * 0.01**2 + (100.0 * rate_u) ** 2, rtol=0.02)
     assert repr(found.snapshot()) == repr(before)
+
+
+def test_a_rate_of_the_offset_that_is_stated_to_begin_at_zero_still_walks() -> None:
+    """Its bound is no division by zero: the walk alone makes the rate uncertain, by 2e-5 a root day."""
+    state = mounted(wander=Wander(offset_rate_mps2=0.0))
+    for day in (0.0, 16.0):
+        state.update(Record.of(building_window(np.random.default_rng(1)), day))
+    assert state.quantity("Qz_rate")[1] == pytest.approx(2e-5 * 4.0, rel=0.01)
