@@ -59,7 +59,7 @@ class Life:
         unknowns = Unknowns(Statements(MEAN, U, {"": priors}, none, TemperatureModel()), [record])
         mean, u = unknowns.prior
         degrees = Degrees.of(unknowns, (np.nan, np.nan), mean)
-        made_rows = Rows(unknowns, [record], np.array([record.day]), Noise(), degrees)
+        made_rows = Rows(unknowns, [record], np.array([record.day]), [Noise()], degrees)
         (found,) = made_rows.at(mean[None], mean[None])
         kept = [k for k, own in enumerate(unknowns.all) if not own.quantity.name.endswith("_rate")]
         quantities = [_of_place(unknowns.all[k].quantity) for k in kept]

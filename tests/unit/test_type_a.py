@@ -44,7 +44,7 @@ def test_a_variance_with_the_covariance_of_neighbours_has_fewer_degrees_of_freed
 
 def test_where_no_segments_tell_it_slopes_and_means_scatter_as_white_noise_makes_them() -> None:
     nothing = replace(Record.of(building_window(np.random.default_rng(3), level_mps2=LEVEL), 0.0), scores=NO_SCORES)
-    pooled = Noise.of([nothing, nothing])
+    *_, pooled = Noise.around([nothing, nothing])
     assert (pooled.slopes, pooled.means, pooled.degrees_of_freedom) == (1.0, 1.0, 0.0)
 
 
