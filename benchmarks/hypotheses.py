@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -110,33 +110,15 @@ def shape(kind: str, size: float, seed: int) -> str:
     return "right" if " or " not in told else "alike"
 
 
-def shapes(seeds: Sequence[int]) -> str:
-    """A row for each kind of change, a column for each size."""
+def table(head: str, judged: Callable[[str, float, int], str], kinds: Iterable[str], seeds: int, *words: str) -> str:
+    """A row for each kind, a column for each size: how often each of the `words` was the verdict of that many seeds."""
     rows = [
-        "| change | " + " | ".join(f"{100 * size:g} %" for size in SIZES) + " |",
+        f"| {head} | " + " | ".join(f"{100 * size:g} %" for size in SIZES) + " |",
         "| --- " * (len(SIZES) + 1) + "|",
     ]
-    for kind in SHAPES:
-        found = []
-        for size in SIZES:
-            count = Counter(shape(kind, size, seed) for seed in seeds)
-            found.append(f"{count['right']}, {count['alike']}, {count['wrong']}, {count['none']}")
-        rows.append(f"| {kind} | {' | '.join(found)} |")
-    return "\n".join(rows)
-
-
-def table(seeds: Sequence[int]) -> str:
-    """A row for each kind, a column for each size."""
-    rows = [
-        "| step of | " + " | ".join(f"{100 * size:g} %" for size in SIZES) + " |",
-        "| --- " * (len(SIZES) + 1) + "|",
-    ]
-    for kind in KINDS:
-        found = []
-        for size in SIZES:
-            count = Counter(verdict(kind, size, seed) for seed in seeds)
-            found.append(f"{count['right']}, {count['wrong']}, {count['undecided']}")
-        rows.append(f"| {kind} | {' | '.join(found)} |")
+    for kind in kinds:
+        counts = [Counter(judged(kind, size, seed) for seed in range(seeds)) for size in SIZES]
+        rows.append(f"| {kind} | {' | '.join(', '.join(str(count[word]) for word in words) for count in counts)} |")
     return "\n".join(rows)
 
 
@@ -146,9 +128,9 @@ if __name__ == "__main__":
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     text = f"`python -m benchmarks.hypotheses`, {machine()}. Right, wrong, undecided of {given.seeds}.\n\n"
-    text += table(range(given.seeds))
+    text += table("step of", verdict, KINDS, given.seeds, "right", "wrong", "undecided")
     text += f"\n\nOf a shape: right, as fitting alike, another one, none, of {given.seeds}.\n\n"
-    text += shapes(range(given.seeds))
+    text += table("change", shape, SHAPES, given.seeds, "right", "alike", "wrong", "none")
     if given.write:
         write_part("hypotheses", text, PAGE)
     else:

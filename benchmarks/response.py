@@ -249,7 +249,7 @@ def one_inside(job: tuple[str, int, int]) -> tuple[str, float]:
     made = pair(seed, band_hz=INSIDE_BAND_HZ, rate_hz=100.0, seconds=60.0, skirts=skirts, **INSIDE[name](random))
     at_hz = Priors(reference=U_REFERENCE, reference_frequency_hz=made.reference_frequency_hz)
     outcome, told = adjusted(made.files, at_hz), "valid at once"
-    if outcome.reasons and "--sensor-filter flat" in outcome.reasons[-1]:
+    if outcome.reasons and "`sensor_filter` flat" in outcome.reasons[-1]:
         outcome, told = adjusted(made.files, at_hz.beside_known(known_of(["flat"], ["flat"]))), "with flat filters"
     elif outcome.reasons:
         return "refused", 0.0

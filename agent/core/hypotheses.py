@@ -120,7 +120,8 @@ def shape_of_change(state: State, day: float, directions: Array, limit: Limit) -
     if best.score > none.score - DECISIVE or best.chi2 > limit(9.0 - best.unknowns):
         return ""
     alike = [shape.words for shape in found if shape.score <= best.score + DECISIVE]
-    return f"S has changed as by {' or '.join(alike)} (chi-squared {best.chi2:.0f}, {none.chi2:.0f} without a change)"
+    chi2 = f"chi-squared {best.chi2:.0f}, {none.chi2:.0f} without a change"
+    return f"the change of S looks like {' or '.join(alike)} ({chi2})"
 
 
 def _shapes(moved: Array, white: Array, S: Array, directions: Array) -> Iterator[Shape]:

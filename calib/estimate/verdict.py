@@ -27,7 +27,7 @@ MISFIT_LIMIT = 0.1  # of the signal; with right signs, 0.01 was left in the wors
 # clamp whose errors are twice its default uncertainty is still used.
 STATED_TIMES = 2.0
 MOST_BETWEEN_BANDS = 0.01  # relative; a pair that is far apart, or turned, deviates by several per cent
-GROSS = 10.0  # chi-squared over its expectation; another unit of the reference gives a hundred and more
+GROSS = 10.0  # chi-squared over its expectation; another unit or a resonance gives a hundred and more
 CONFOUNDED_LAG = 0.01  # largest error of S due to an undetermined lag, relative to the scale of S
 
 

@@ -230,7 +230,7 @@ def _shared_in(pose: Pose, live: NDArray[np.bool_], along: Array, ahead: Array) 
     return replace(pose, along=moving, along_rate_s=rate)
 
 
-def _power(window: Window, between: bool = False) -> Array:
+def _power(window: Window, *, between: bool = False) -> Array:
     """(2 m, 2 m) covariance of u and du/dt of a reference's own channels within segments; with that `between` them."""
     sums, m = window.sums, own_channels(window.sums.reference_channels)
     columns = np.r_[0:m, sums.reference_channels : sums.reference_channels + m]
