@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from calib.estimate.banded import Banded, banded
-from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, Index, Segments, TypeA, in_order, pooled
+from calib.estimate.type_a import LEAST_INFLATION, Index, Segments, TypeA, in_order, pooled
 from calib.excitation.excited import NOISE_LEFT, OF_STRONGEST, OVER_NOISE
 from calib.model import Array, BandSums, WindowSums, own_channels
 from calib.signal.response import POWERS
@@ -131,10 +131,8 @@ def effective(data: Condensed, independent: Array) -> Condensed:
     shows how much fewer there are still.
     """
     type_a, live = data.type_a, np.repeat(np.any(np.diagonal(data.root, axis1=1, axis2=2) > 0.0, axis=0), 3)
-    freedom = type_a.degrees_of_freedom if np.isfinite(type_a.degrees_of_freedom) else 0.0
-    own = min(freedom / FEWEST_FREEDOM, 1.0)
     seen = [type_a.slope_ratio(live) if live.any() else 1.0, np.diag(type_a.means).mean()]
-    slopes, means = (max(own * float(ratio) + 1.0 - own, LEAST_INFLATION) for ratio in seen)
+    slopes, means = (max(type_a.known * float(ratio) + 1.0 - type_a.known, LEAST_INFLATION) for ratio in seen)
     less = np.sqrt(slopes / independent)[:, None, None]
     return replace(
         data,

@@ -22,7 +22,7 @@ from calib.estimate.quantities import (
 )
 from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
-from calib.estimate.type_a import FEWEST_FREEDOM, LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
+from calib.estimate.type_a import LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
 from calib.estimate.unknowns import Unknowns
 from calib.model import Array, own_channels
 
@@ -78,8 +78,7 @@ class Noise:
 def _beside_white(found: Scattered | None) -> float:
     if found is None:
         return 1.0
-    own = min(found.degrees_of_freedom / FEWEST_FREEDOM, 1.0)
-    return own * found.variance + 1.0 - own
+    return found.known * found.variance + 1.0 - found.known
 
 
 @dataclass(frozen=True, slots=True)

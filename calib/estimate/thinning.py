@@ -24,7 +24,7 @@ WIDTHS = ((0.0, 1.0 / 24.0), (14.0, 1.0), (60.0, 7.0), (400.0, 14.0), (1200.0, 3
 MOST = 650  # records: 2 MB with three axes of a reference. Of many positions and references the widths are doubled
 WIDEST = 4096.0  # times the widths
 BRIEF_DAYS = 1.0  # so long Q is the same at all temperatures of a record
-BIN_K = 10.0  # records whose temperatures differ by more stay apart: S may depend on it
+BIN_K = 5.0  # records whose temperatures differ by more stay apart: S may depend on it
 
 
 def thinned(records: Sequence[Record], now: float, nominal: Array, cuts: Sequence[float] = ()) -> list[Record]:

@@ -56,6 +56,7 @@ class TypeA:
     `noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
     `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were what a filter makes of
     white noise, independent between axes. `degrees_of_freedom` of both, inf where single segments allow no estimate.
+    `known`: how far segments tell it, 1 where they are enough; else the rest is what a filter makes of white noise.
     `scores` (2, LEVELS, SUMS): the sums of both from which this follows.
     """
 
@@ -63,6 +64,7 @@ class TypeA:
     slopes: Array
     means: Array
     degrees_of_freedom: float
+    known: float
     scores: Array
 
     def slope_ratio(self, live: Flags) -> float:
@@ -100,9 +102,12 @@ def pooled(
         score = (part.total[..., -3:] - part.total[..., :-3] @ beta) / unit
         mean_scores.append(score / np.sqrt(part.count.sum(1))[:, None, None])
     live = np.repeat(np.any([np.any(np.diagonal(r, axis1=1, axis2=2) > 0.0, axis=0) for r in roots], axis=0), 3)
-    slope_cov, slope_dof, of_slopes = _scatter(slope_scores, live)
-    mean_cov, mean_dof, of_means = _scatter(mean_scores, np.ones(3, dtype=bool))
-    return TypeA(noise, slope_cov, mean_cov, min(slope_dof, mean_dof), np.array([of_slopes, of_means]))
+    slope_cov, of_slopes, sums = _scatter(slope_scores, live)
+    mean_cov, of_means, mean_sums = _scatter(mean_scores, np.ones(3, dtype=bool))
+    found = [own for own in (of_slopes, of_means) if own is not None]
+    freedom = min((own.degrees_of_freedom for own in found), default=np.inf)
+    known = min((own.known for own in found), default=0.0)
+    return TypeA(noise, slope_cov, mean_cov, freedom, known, np.array([sums, mean_sums]))
 
 
 def _noise(part: Segments, slopes: Array, root: Array) -> Array:
@@ -117,31 +122,44 @@ def _noise(part: Segments, slopes: Array, root: Array) -> Array:
     return np.asarray(np.maximum(spread, np.where(floor > 0.0, floor, 1.0)[:, None]))
 
 
-def _scatter(scores: list[Array], live: Flags) -> tuple[Array, float, Array]:
-    """Covariance (D, D) of a window's summed scores, its degrees of freedom, and `score_sums`; `live` (D,) are those
-    with data.
+def _scatter(scores: list[Array], live: Flags) -> tuple[Array, Scattered | None, Array]:
+    """Covariance (D, D) of a window's summed scores, what it rests on, and `score_sums`; `live` (D,) are those with
+    data.
 
     `scores` (W, K, D) of windows with K segments each.
     """
     sums = score_sums([s[..., live] for s in scores])
     found = scattered(sums)
     if found is None:
-        return np.eye(len(live)), np.inf, sums
+        return np.eye(len(live)), None, sums
     for _ in range(found.level):
         scores = [_paired(s) for s in scores]
     covariance = np.sum([s.shape[1] * _flat(s).T @ _flat(s) for s in scores], axis=0) / sums[found.level, 0]
-    return covariance * found.inflation, found.degrees_of_freedom, sums
+    return covariance * found.inflation, found, sums
 
 
 @dataclass(frozen=True, slots=True)
 class Scattered:
     """How much scores scatter: the `variance` of a window's sum of them, over that of white noise, of segments joined
-    `level` times; it has the `inflation` by which neighbours that correlate make it larger."""
+    `level` times; it has the `inflation` by which neighbours that correlate make it larger. `freedom`: segments less
+    one, of all windows."""
 
     level: int
     variance: float
     inflation: float
-    degrees_of_freedom: float
+    freedom: float
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the variance. With that of a score and twice the covariance of neighbours, gamma0 + 2 gamma1, it scatters
+        as a mean of squares of a third of the segments: of n white scores 2 (1 + 2) / n in the place of 2 / n, with
+        gamma1 / gamma0 = 0.3 little less (Bartlett's formula)."""
+        return self.freedom / 3.0 if self.inflation > 1.0 else self.freedom
+
+    @property
+    def known(self) -> float:
+        """How far segments tell the variance, 1 where they are enough."""
+        return min(self.freedom / FEWEST_FREEDOM, 1.0)
 
 
 def score_sums(scores: Sequence[Array]) -> Array:
@@ -188,8 +206,7 @@ def scattered(sums: Array) -> Scattered | None:
             return Scattered(level, variance, 1.0, freedom)
         naive = gamma0 - 2.0 * gamma1 / typical  # what the variance above expects, neighbours being correlated
         inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
-        # rho itself is known from as little
-        return Scattered(level, variance * inflation, inflation, freedom / (1.0 + 0.5 * inflation))
+        return Scattered(level, variance * inflation, inflation, freedom)
     raise AssertionError("the last level is never joined again")
 
 

@@ -6,13 +6,12 @@ import numpy as np
 
 from calib.excitation.turning import feels_gravity
 from calib.model import Array
-from calib.signal.band import STOP_BAND, band_above_noise, noise_in_band, power_share_above
+from calib.signal.band import STOP_BAND, band_above_noise, noise_in_bands, power_share_above
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import BAND, DIFFERENTIATED_BAND_HZ, differentiated_band_hz
 
 NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
 FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
-RESAMPLED_BAND = 0.35  # of the reference's rate, to which interpolation itself passes noise
 # 1 % of gravity. A reference that moves by more beside a sensor does not rest.
 LEAST_MOTION_MPS2 = 0.1
 TOO_FAST = 0.01  # of the power of the reference: what interpolation loses of so little does not show
@@ -20,19 +19,25 @@ AS_FAST = 0.9  # of the sensor's rate; two devices of one nominal rate differ by
 
 
 def band_to_keep(
-    raw: Array, u: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float], to_hz: float | None
+    raw: Array,
+    u: Array,
+    V: Array,
+    instrument: Instrument,
+    rates_hz: tuple[float, float],
+    widest_hz: Array,
+    to_hz: float | None,
 ) -> tuple[float | None, Array]:
     """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left.
 
-    `rates_hz`: of the reference and of the sensor. `to_hz` as in Settings.
+    `rates_hz`: of the reference and of the sensor. `widest_hz` (2,): the bands of the noise in u and du/dt that
+    interpolation leaves (calib.signal.resampling.Resampled). `to_hz` as in Settings.
     """
     rate_hz, derivatives, m = rates_hz[0], instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
     density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
-    widest_hz = RESAMPLED_BAND * rate_hz
     if derivatives:
-        widest_hz = min(DIFFERENTIATED_BAND_HZ, widest_hz)
-    unlimited = noise_in_band(instrument.known.noise(widest_hz, rate_hz) * density, widest_hz, derivatives)
+        widest_hz = np.minimum(DIFFERENTIATED_BAND_HZ, widest_hz)
+    unlimited = noise_in_bands(instrument.known.noise(float(widest_hz[0]), rate_hz) * density, widest_hz, derivatives)
     whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
     power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
     noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
@@ -41,8 +46,8 @@ def band_to_keep(
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
     if band_hz is None:
         return None, unlimited.reshape(2, m)
-    noise_hz = min(FILTER_BAND * band_hz, widest_hz)
-    return band_hz, noise_in_band(instrument.known.noise(noise_hz, rate_hz) * density, noise_hz, derivatives)
+    noise_hz = np.minimum(FILTER_BAND * band_hz, widest_hz)
+    return band_hz, noise_in_bands(instrument.known.noise(float(noise_hz[0]), rate_hz) * density, noise_hz, derivatives)
 
 
 def _told_hz(

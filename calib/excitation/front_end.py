@@ -180,11 +180,11 @@ def aligned(
         if struck.any():
             made = beside(sensor.values - np.where(struck[:, None], residual, 0.0))
             shown = np.isfinite(made.columns).all(axis=1) & inside
-    columns, raw, u, V, raw_filled, filled = made
+    columns, raw, u, V, raw_filled, filled, noise_hz = made
     hums_hz = hum_hz(columns[shown, 3 : 3 + m], columns[shown, :3], sensor_rate_hz) if settings.limit_band else []
     if hums_hz:
         columns = without_lines(columns, sensor_rate_hz, hums_hz)
-    band_hz, noise = band_to_keep(raw, u, V, instrument, (rate_hz, sensor_rate_hz), settings.to_hz)
+    band_hz, noise = band_to_keep(raw, u, V, instrument, (rate_hz, sensor_rate_hz), noise_hz, settings.to_hz)
     clipped, independent, unfiltered = 0, 1.0, as_measured.columns if struck.any() else columns
     if band_hz is not None and settings.limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
@@ -223,7 +223,7 @@ def aligned(
 class _Beside(NamedTuple):
     """Sensor and reference side by side: `columns` (n, 3 + 2 k) are V, u and du at the sensor's times, NaN where one is
     missing; `raw` (r, m) and `V` (n, 3) before, their short holes filled, and which of them were; `u` (q, m) where
-    the reference is known."""
+    the reference is known, `noise_hz` (2,) as in calib.signal.resampling.Resampled."""
 
     columns: Array
     raw: Array
@@ -231,6 +231,7 @@ class _Beside(NamedTuple):
     V: Array
     raw_filled: Mask
     filled: Mask
+    noise_hz: Array
 
 
 def _side_by_side(
@@ -255,7 +256,7 @@ def _side_by_side(
     k, rows = u.shape[1], np.empty((3 + 2 * u.shape[1], len(V)))  # here and in what is kept: a channel is a row
     rows[:3], rows[3 : 3 + k], rows[3 + k :] = V.T, at.u.T, at.du.T
     rows[:, ~at.usable] = np.nan
-    return _Beside(rows.T, raw, at.u[at.usable][:, :m], V, raw_filled, filled)
+    return _Beside(rows.T, raw, at.u[at.usable][:, :m], V, raw_filled, filled, at.noise_hz)
 
 
 def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:

@@ -96,15 +96,16 @@ def _bridged(x: Array) -> Array:
     return out
 
 
-def noise_in_band(density: Array, band_hz: float, derivatives: int) -> Array:
-    """(2, m) rms of a reference's white noise within `band_hz`: in the acceleration (m/s2), in its derivative (m/s3).
+def noise_in_bands(density: Array, bands_hz: Array, derivatives: int) -> Array:
+    """(2, m) rms of a reference's white noise: in the acceleration (m/s2) up to the first of two frequencies, in its
+    derivative (m/s3) up to the second one.
 
     `density` (m,) is the noise of the measured quantity per root Hz; `derivatives` is how often that quantity was
     differentiated to give the acceleration: 0 for acceleration, 1 for velocity, 2 for displacement.
     """
-    turn = 2.0 * np.pi
-    powers = [turn ** (2 * k) * band_hz ** (2 * k + 1) / (2 * k + 1) for k in (derivatives, derivatives + 1)]
-    return np.asarray(np.sqrt(np.array(powers))[:, None] * density)
+    k = np.array([derivatives, derivatives + 1])
+    powers = (2.0 * np.pi) ** (2 * k) * bands_hz ** (2 * k + 1) / (2 * k + 1)
+    return np.asarray(np.sqrt(powers)[:, None] * density)
 
 
 def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:

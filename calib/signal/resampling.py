@@ -24,6 +24,7 @@ HALF = TAPS // 2
 BAND = 0.3  # of the sampling rate: the taps are the best for motion below
 RIDGE = 1e-11  # holds the noise amplification at one: more costs accuracy, less costs noise
 NODES = 64  # samples between the points at which the clock is inverted: straight in between to 1 ns
+FRACTIONS = 256  # classes of the fractional position, over which the noise that interpolation passes is averaged
 CHUNK = 2048  # output samples worked on at a time: 16 taps of each fit into the cache
 # A signal is differentiated up to here and damped from twice as much: the paper's range and three octaves above it.
 DIFFERENTIATED_BAND_HZ = 50.0
@@ -35,11 +36,16 @@ STOP_BAND_DB = {1: 110.0, 2: 150.0}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resampled:
-    """The reference at given times: u (n, m) and du/dt (n, m); `usable` (n,) where all taps were there."""
+    """The reference at given times: u (n, m) and du/dt (n, m); `usable` (n,) where all taps were there.
+
+    `noise_hz` (2,): the bands in which white noise of the reference's samples has the power that it has in u and in
+    du/dt. At times between its samples u has less of it than at their times.
+    """
 
     u: Array
     du: Array
     usable: NDArray[np.bool_]
+    noise_hz: Array
 
 
 def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, margin: int = 0) -> Resampled:
@@ -66,7 +72,7 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
     u, du = np.zeros((x.shape[1], len(position))), np.zeros((x.shape[1], len(position)))
     inside = np.nonzero(usable)[0]
     if not len(inside):
-        return Resampled(u.T, du.T, usable)
+        return Resampled(u.T, du.T, usable, np.zeros(2))
     middle_s = 0.5 * (time_s[(len(time_s) - 1) // 2] + time_s[len(time_s) // 2])
     before_s, after_s = clock.time_of(clock.index_of(middle_s) + np.array([-0.5, 0.5])).tolist()
     rate = 1.0 / (after_s - before_s)
@@ -79,7 +85,7 @@ def resample(x: Array, clock: ClockFit, time_s: Array, first_index: int = 0, mar
             taps = np.ascontiguousarray(views[:, low : high + 1 - TAPS])
             value, slope = _horner(_taken(_weights() @ taps, first - low), fraction[part])
             u[channel, part], du[channel, part] = value, slope * rate
-    return Resampled(u.T, du.T, usable)
+    return Resampled(u.T, du.T, usable, rate * _noise_bands(fraction[inside]))
 
 
 def differentiate(x: Array, rate_hz: float, order: int = 1) -> tuple[Array, int]:
@@ -159,6 +165,23 @@ def _horner(sums: Array, fraction: Array) -> tuple[Array, Array]:
         value *= fraction
         value += sums[k]
     return value, slope
+
+
+def _noise_bands(fraction: Array) -> Array:
+    """(2,) as Resampled.noise_hz, over the sampling rate, at fractional positions (n,)."""
+    classes = np.minimum((fraction * FRACTIONS).astype(np.intp), FRACTIONS - 1)
+    power, rate_power = np.bincount(classes, minlength=FRACTIONS) @ _noise_passed() / len(fraction)
+    return np.array([0.5 * power, np.cbrt(3.0 * rate_power / (8.0 * np.pi**2))])
+
+
+@lru_cache(maxsize=1)
+def _noise_passed() -> Array:
+    """(FRACTIONS, 2) by class of the fractional position, the power of a value and of its derivative, of white samples
+    of power one."""
+    middle, powers = (np.arange(FRACTIONS)[:, None] + 0.5) / FRACTIONS, np.arange(DEGREE + 1)
+    value = middle**powers @ _weights()
+    slope = powers[1:] * middle ** powers[:-1] @ _weights()[1:]
+    return np.column_stack([np.sum(value**2, axis=1), np.sum(slope**2, axis=1)])
 
 
 @lru_cache(maxsize=1)

@@ -64,6 +64,8 @@ REVISIONS = (
     Revision(12, "f21d15057af9", "0.2.0"),
     # The last before noise is pooled over windows nearby.
     Revision(13, "d383a3c8cd5e", "0.2.0"),
+    # The last before the noise that interpolation passes follows from where it interpolates.
+    Revision(14, "ed64250afe1b", "0.2.0"),
 )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.signal.band import noise_in_bands
 from calib.signal.resampling import differentiate, differentiated_band_hz, resample
 from calib.signal.stamps import clock_from_stamps
 
@@ -45,6 +46,19 @@ def test_part_of_a_recording_is_the_same_as_the_whole() -> None:
     whole, part = resample(x, CLOCK, t), resample(x[1500:3500], CLOCK, t, first_index=1500)
     assert part.usable.all()
     np.testing.assert_allclose(part.u, whole.u, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("after", [0.0, 0.25, 0.5, None])
+def test_white_noise_has_the_power_that_its_bands_tell(after: float | None) -> None:
+    """At the samples of the reference u has all of it, halfway between them 14 % less; `after` None: everywhere between
+    them. 200 channels of 4900 points know a power to 0.2 %."""
+    x = np.random.default_rng(1).normal(size=(5000, 200))
+    t = t_sensor if after is None else t_ref + after / RATE_HZ
+    out = resample(x, CLOCK, t)
+    density = np.full(200, 1.0 / np.sqrt(0.5 * RATE_HZ))
+    told = noise_in_bands(density, out.noise_hz, 0)
+    assert np.sqrt(np.mean(out.u[out.usable] ** 2)) == pytest.approx(told[0, 0], rel=4e-3)
+    assert np.sqrt(np.mean(out.du[out.usable] ** 2)) == pytest.approx(told[1, 0], rel=4e-3)
 
 
 def test_nothing_is_interpolated_across_a_gap() -> None:
