@@ -84,7 +84,8 @@ class ChannelState:
                 results += self._say_status(f"{self.sensor} sends data again")
             self._streams.look_where(block, self._estimation)
             taken = self._streams.by_device[self.sensor], self._time.origin_utc_ns
-            results += accelerations(block, *taken, self._channel, self._estimation, self._in_force)
+            suspect = self._streams.suspect(block.device)
+            results += accelerations(block, *taken, self._channel, self._estimation, self._in_force, suspect)
         return results + list(self._close_windows()) + self._clock_reports()
 
     def on_tick(self, tick: Tick) -> list[Result]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.config import Channel
 from agent.core.estimation import Estimation
@@ -19,10 +20,12 @@ def accelerations(
     channel: Channel,
     estimation: Estimation,
     in_force: CalibrationUpdate | None,
+    suspect: NDArray[np.bool_],
 ) -> list[Acceleration]:
     """A block as accelerations in m/s2; empty if the channel has none, the block not three axes, or S no inverse.
 
     `stream` gives the sample times, `origin_utc_ns` is UTC at its origin. If `in_force` is None, the prior is used.
+    `suspect` (3,): outputs of which samples in the block are wrong.
     """
     if channel.acceleration == "off" or block.indications.shape[1] != 3 or not block.n:
         return []
@@ -44,6 +47,7 @@ def accelerations(
         calibration_run_id="" if in_force is None else in_force.made[0],
         calibration_sequence=0 if in_force is None else in_force.made[1],
         dynamic_only=channel.coupling == "ac",
+        suspect=suspect,
         recorded=channel.acceleration == "record",
     )
     return [made]

@@ -339,7 +339,8 @@ class Acceleration:
     """A block of the corrected stream, a = S^-1 (V - Q) in m/s2, in the sensor's frame.
 
     `acceleration` (N, 3); sample i was taken at `t_utc_ns` + i / `rate_hz`. `covariance` (3, 3) in m2/s4 is the
-    calibration's part at the block's mean, `noise` (3,) in m/s2 the residual SD of one sample. `determined` (12,) of
+    calibration's part at the block's mean, `noise` (3,) in m/s2 the residual SD of one sample. `suspect` (3,): outputs
+    of which samples in the block are wrong (calib.signal.outputs); S mixes them into each axis. `determined` (12,) of
     the calibration used, which `calibration_run_id` and `calibration_sequence` name (0: the prior). Blocks have no
     sequence number; `first_index` counts the samples.
     """
@@ -355,6 +356,7 @@ class Acceleration:
     calibration_run_id: str
     calibration_sequence: int
     dynamic_only: bool  # True for an AC-coupled sensor: the mean acceleration is not measured
+    suspect: NDArray[np.bool_]
     recorded: bool  # whether the block is written to the recording too
 
 

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.core.stream import SATURATED, UNCOUNTED, DeviceStream
 from calib.geometry import AXES
@@ -44,11 +45,13 @@ class RawWatch:
         self._faults: dict[str, list[Fault]] = {}
         self._told_s: dict[str, dict[str, float]] = {}  # when the message of a kind was told last, by device
         self._seen: dict[str, list[tuple[float, list[int]]]] = {}  # times and counts of what happens now and then
+        self._flipping: set[str] = set()  # devices of which wrong bits are told
 
     def forget(self, device: str) -> None:
         """Another device has this name now."""
         for kept in (self._outputs, self._faults, self._told_s, self._seen):
             kept.pop(device, None)
+        self._flipping.discard(device)
 
     def motion(self, device: str) -> Array | None:
         """(m, m) covariance of the slow motion that a device shows now, in its own unit; None before any block."""
@@ -95,6 +98,16 @@ class RawWatch:
         faults = (fault for device in devices for fault in self._faults.get(device, []))
         return next((fault.said for fault in faults if fault.start_s < stop_s and fault.stop_s > start_s), "")
 
+    def suspect(self, device: str) -> NDArray[np.bool_]:
+        """(A,) the outputs of which samples are wrong in the block that was taken last: they hold one value, or were
+        read twice; wrong bits as long as they are told, since a single one may be a knock."""
+        outputs = self._outputs[device]
+        found = outputs.stuck_or_repeated.copy()
+        for fault in self._faults.get(device, []):
+            if fault.held is not None and fault.stop_s == np.inf:
+                found[fault.held.axis] = True
+        return found | outputs.flips if device in self._flipping else found
+
     def _once(self, device: str, kind: str, said: str, now_s: float) -> list[str]:
         """The message, unless one of this kind was told a short time ago."""
         before = self._told_s.setdefault(device, {})
@@ -118,7 +131,9 @@ class RawWatch:
         ]
         if repeats >= FEW:
             found.append(("its driver gave the same samples twice", repeats))
+        self._flipping.discard(device)
         if flipped >= max(FEW_FLIPS, FLIPS * alone):
+            self._flipping.add(device)
             found.append(
                 ("single samples are off by a power of two (a bit is read wrongly: check cable and bus)", flipped)
             )
@@ -133,6 +148,7 @@ class RawWatch:
             "faults": {device: [asdict(fault) for fault in faults] for device, faults in self._faults.items()},
             "told_s": {device: dict(told) for device, told in self._told_s.items()},
             "seen": {device: [[at, list(own)] for at, own in seen] for device, seen in self._seen.items()},
+            "flipping": sorted(self._flipping),
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
@@ -141,6 +157,7 @@ class RawWatch:
         self._faults = {device: [_fault(own) for own in faults] for device, faults in state["faults"].items()}
         self._told_s = {device: dict(told) for device, told in state["told_s"].items()}
         self._seen = {device: [(at, list(own)) for at, own in seen] for device, seen in state["seen"].items()}
+        self._flipping = set(state.get("flipping", []))
 
 
 def _fault(state: Mapping[str, Any]) -> Fault:

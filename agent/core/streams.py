@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.config import Channel
 from agent.core.estimation import DAY_S, Estimation, Judged
@@ -109,6 +110,10 @@ class Streams:
         if block.device == self._channel.sensor:
             expected = self._expected(scale, len(expected))
         return self._raw.update(block, self.by_device[block.device], expected, origin_utc_ns)
+
+    def suspect(self, device: str) -> NDArray[np.bool_]:
+        """(A,) the outputs of which samples are wrong in the block that `watch` took last."""
+        return self._raw.suspect(device)
 
     def _expected(self, scale: float, axes: int) -> Array:
         """(A,) rms of the newest motion along each axis of the sensor by its reference, in output unit."""

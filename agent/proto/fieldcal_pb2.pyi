@@ -618,7 +618,7 @@ class Clock(_message.Message):
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., device: _Optional[str] = ..., role: _Optional[str] = ..., nominal_rate_hz: _Optional[float] = ..., rate_hz: _Optional[float] = ..., u_rate_hz: _Optional[float] = ..., offset_s: _Optional[float] = ..., u_offset_s: _Optional[float] = ..., jitter_s: _Optional[float] = ..., lag_s: _Optional[float] = ..., u_lag_s: _Optional[float] = ..., arrivals: _Optional[int] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Acceleration(_message.Message):
-    __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only")
+    __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only", "suspect")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SENSOR_FIELD_NUMBER: _ClassVar[int]
     T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
@@ -633,6 +633,7 @@ class Acceleration(_message.Message):
     CALIBRATION_RUN_ID_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DYNAMIC_ONLY_FIELD_NUMBER: _ClassVar[int]
+    SUSPECT_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     sensor: str
     t_utc_ns: int
@@ -647,10 +648,11 @@ class Acceleration(_message.Message):
     calibration_run_id: str
     calibration_sequence: int
     dynamic_only: bool
-    def __init__(self, event_sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., z: _Optional[_Iterable[float]] = ..., covariance: _Optional[_Iterable[float]] = ..., noise: _Optional[_Iterable[float]] = ..., determined: _Optional[_Iterable[bool]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., dynamic_only: _Optional[bool] = ...) -> None: ...
+    suspect: _containers.RepeatedScalarFieldContainer[bool]
+    def __init__(self, event_sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., x: _Optional[_Iterable[float]] = ..., y: _Optional[_Iterable[float]] = ..., z: _Optional[_Iterable[float]] = ..., covariance: _Optional[_Iterable[float]] = ..., noise: _Optional[_Iterable[float]] = ..., determined: _Optional[_Iterable[bool]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., dynamic_only: _Optional[bool] = ..., suspect: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class AccelerationBytes(_message.Message):
-    __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only")
+    __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only", "suspect")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     SENSOR_FIELD_NUMBER: _ClassVar[int]
     T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
@@ -665,6 +667,7 @@ class AccelerationBytes(_message.Message):
     CALIBRATION_RUN_ID_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DYNAMIC_ONLY_FIELD_NUMBER: _ClassVar[int]
+    SUSPECT_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     sensor: str
     t_utc_ns: int
@@ -679,4 +682,5 @@ class AccelerationBytes(_message.Message):
     calibration_run_id: str
     calibration_sequence: int
     dynamic_only: bool
-    def __init__(self, event_sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., x: _Optional[bytes] = ..., y: _Optional[bytes] = ..., z: _Optional[bytes] = ..., covariance: _Optional[bytes] = ..., noise: _Optional[bytes] = ..., determined: _Optional[_Iterable[bool]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., dynamic_only: _Optional[bool] = ...) -> None: ...
+    suspect: _containers.RepeatedScalarFieldContainer[bool]
+    def __init__(self, event_sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., first_index: _Optional[int] = ..., rate_hz: _Optional[float] = ..., x: _Optional[bytes] = ..., y: _Optional[bytes] = ..., z: _Optional[bytes] = ..., covariance: _Optional[bytes] = ..., noise: _Optional[bytes] = ..., determined: _Optional[_Iterable[bool]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., dynamic_only: _Optional[bool] = ..., suspect: _Optional[_Iterable[bool]] = ...) -> None: ...

@@ -63,6 +63,10 @@ class Outputs:
         self.step = np.inf  # the smallest change of any output: the resolution
         self.sticks: NDArray[np.int64] = np.zeros(axes, dtype=np.int64)
         self.repeats = self.alone = self.flipped = 0
+        # In the last update: the outputs that held one value, or all of a burst that was read twice; and those with
+        # samples that stand alone as a wrong bit makes them.
+        self.stuck_or_repeated: NDArray[np.bool_] = np.zeros(axes, dtype=np.bool_)
+        self.flips: NDArray[np.bool_] = np.zeros(axes, dtype=np.bool_)
         # Samples: so far, before they were counted anew, and the number of the next one.
         self._taken = self._begun = self._next = 0
         self._rate_hz = 1.0
@@ -91,6 +95,7 @@ class Outputs:
         """
         if not len(x):
             return
+        self.stuck_or_repeated, self.flips = np.zeros_like(self.flips), np.zeros_like(self.flips)
         if anew or not self._taken:
             self._begun, self._last, self._ends = self._taken, x[0], np.stack([x[0], x[0]])
             self._same[0], self._same[1] = self._near[0], self._near[1] = self._taken, first
@@ -157,8 +162,11 @@ class Outputs:
         for k in range(x.shape[1]):
             if len(at := np.flatnonzero(moved[:, k])):
                 runs = np.diff(np.concatenate([[self._same[0, k]], self._taken + at]))
-                self.sticks[k] += np.count_nonzero(runs >= least) if fine[k] else 0
+                sticks = np.count_nonzero(runs >= least) if fine[k] else 0
+                self.sticks[k] += sticks
+                self.stuck_or_repeated[k] = sticks > 0
                 self._same[:, k] = self._taken + at[-1], first + at[-1]
+            self.stuck_or_repeated[k] |= fine[k] and self._taken + len(x) - self._same[0, k] >= least
             if ends[1, k] - ends[0, k] <= one_step:
                 self._ends[:, k] = ends[:, k]
             else:
@@ -180,7 +188,9 @@ class Outputs:
             changes = np.count_nonzero((np.diff(burst, axis=0) != 0.0).any(axis=1))
             both = np.vstack([before, burst])
             periodic = any(np.array_equal(both[lag:], both[:-lag]) for lag in range(1, len(burst) // 2 + 1))
-            self.repeats += bool(changes >= LEAST_CHANGES and not periodic)
+            if changes >= LEAST_CHANGES and not periodic:
+                self.repeats += 1
+                self.stuck_or_repeated[:] = True
 
     def _look_for_flips(self, x: Array) -> None:
         """Samples within the block that stand alone."""
@@ -188,10 +198,12 @@ class Outputs:
         if not len(away):
             return
         usual = np.maximum(median(np.ascontiguousarray(away.T)), self.step)
-        found = away[(away > ALONE * usual) & (between < BETWEEN * away)] / self.step
-        power = np.exp2(np.round(np.log2(found)))
-        self.alone += len(found)
-        self.flipped += int(np.count_nonzero(np.abs(found - power) < NEAR_POWER * power))
+        alone, size = (away > ALONE * usual) & (between < BETWEEN * away), away / self.step
+        power = np.exp2(np.round(np.log2(size)))
+        flipped = alone & (np.abs(size - power) < NEAR_POWER * power)
+        self.alone += int(np.count_nonzero(alone))
+        self.flipped += int(np.count_nonzero(flipped))
+        self.flips = np.any(flipped, axis=0)
 
     def _find_noise(self, x: Array) -> None:
         size = max(CHUNK, round(CHUNK_S * self._rate_hz))

@@ -109,6 +109,7 @@ class CommandedGateway:
             sensor="mems", t_utc_ns=time.time_ns(), first_index=0, rate_hz=200.0, acceleration=wave,
             covariance=np.eye(3), noise=np.ones(3), determined=np.ones(12, dtype=bool), calibration_run_id="r",
             calibration_sequence=103, dynamic_only=False, recorded=True,
+            suspect=np.zeros(3, dtype=bool),
         )  # fmt: skip
         self._publisher.stream("mems", encode_acceleration(1, block))
 

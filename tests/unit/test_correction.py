@@ -101,6 +101,7 @@ def test_a_block_comes_back_from_the_wire_bit_for_bit(n: int, seed: int) -> None
         sensor="s", t_utc_ns=5, first_index=7, rate_hz=999.7, acceleration=random.normal(size=(n, 3)),
         covariance=random.normal(size=(3, 3)), noise=random.random(3), determined=random.random(12) > 0.5,
         calibration_run_id="r", calibration_sequence=9, dynamic_only=True, recorded=True,
+        suspect=np.array([False, True, False]),
     )  # fmt: skip
     number, back = decode(schema_of(topic_of(block)), encode(3, block))
     assert number == 3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 
 import numpy as np
@@ -96,16 +96,26 @@ def test_a_quiet_sensor_of_12_bits_is_not_called_stuck(motion: str, noise: float
     assert alarms(1, 0.1, MOTIONS[motion], noise) == []
 
 
-def fed(x: Array, bursts: int = BURST) -> list[str]:
-    """What is told of the samples (n, 3) of a device, one block of 1 s after the other."""
-    watch, stream, found, size = RawWatch(600.0), DeviceStream("s", 0), list[str](), round(RATE_HZ)
+def watched(x: Array, bursts: int = BURST) -> Iterator[tuple[list[str], Array]]:
+    """Samples (n, 3) of a device, one block of 1 s after the other: what is told after each, and which outputs (3,) of
+    it are marked in the corrected stream."""
+    watch, stream, size = RawWatch(600.0), DeviceStream("s", 0), round(RATE_HZ)
     for first in range(0, len(x), size):
         count = np.arange(bursts, size + 1, bursts, dtype=np.int32)
         arrivals = np.round((first + count) / RATE_HZ * 1e9).astype(np.int64)
         block = SampleBlock("s", "boot", int(arrivals[-1]), first, RATE_HZ, arrivals, count, x[first : first + size])
         stream.update(block)
-        found += watch.update(block, stream, np.zeros(3), 0)
-    return found
+        yield watch.update(block, stream, np.zeros(3), 0), watch.suspect("s")
+
+
+def fed(x: Array, bursts: int = BURST) -> list[str]:
+    """What is told of the samples."""
+    return [text for said, _ in watched(x, bursts) for text in said]
+
+
+def marked(x: Array) -> Array:
+    """(n, 3) the outputs that are marked, of each block."""
+    return np.array([suspect for _, suspect in watched(x)])
 
 
 def test_bursts_that_a_driver_gives_twice_are_told() -> None:
@@ -115,6 +125,8 @@ def test_bursts_that_a_driver_gives_twice_are_told() -> None:
         x[first + BURST : first + 2 * BURST] = x[first : first + BURST]
     (said,) = fed(x)
     assert said.startswith("s: its driver gave the same samples twice, 3 times within ")
+    assert np.flatnonzero(marked(x).all(axis=1)).tolist() == np.flatnonzero(marked(x).any(axis=1)).tolist()
+    assert np.flatnonzero(marked(x)[:, 0]).tolist() == [80, 82, 84, 86, 88]
     sine = np.sin(2.0 * np.pi * np.arange(12_000) / 5.0)[:, None] * [0.0, 500.0, 100.0]  # 20 Hz, locked to the clock
     assert fed(np.round(sine)) == []
 
@@ -122,9 +134,16 @@ def test_bursts_that_a_driver_gives_twice_are_told() -> None:
 def test_an_output_that_sticks_now_and_then_is_told() -> None:
     random = np.random.default_rng(2)
     x = random.normal(size=(30_000, 3)).round(2)
-    for at in random.integers(9000, 30_000, 14).tolist():  # four a minute
-        x[at : at + random.integers(20, 100), 0] = x[at, 0]
+    seen = set[int]()
+    for at in random.integers(9000, 29_900, 14).tolist():  # four a minute
+        end = at + random.integers(20, 100)
+        x[at:end, 0] = x[at, 0]
+        seen |= {at // 100, end // 100}
     (said,) = fed(x)
+    marks = marked(x)
+    assert not marks[:, 1:].any()
+    assert set(np.flatnonzero(marks[:, 0]).tolist()) <= seen
+    assert marks[:, 0].sum() >= 14  # a stick that goes on into the next block is marked there, at least
     assert said.startswith("s: x sticks: it held one value for a short time, 3 times within ")
 
 
@@ -137,6 +156,9 @@ def test_bits_that_are_read_wrongly_are_told() -> None:
     assert said.startswith(
         "s: single samples are off by a power of two (a bit is read wrongly: check cable and bus), 1"
     )
+    wrong = (np.abs(flipped - sound) > 2.0**12).reshape(-1, 100, 3).any(axis=1)  # larger than anything in the noise
+    assert marked(flipped)[60:][wrong[60:]].mean() > 0.9
+    assert not marked(sound).any()
     knocks = np.where(at, sound + 10.0 ** random.uniform(4.0, 5.7, sound.shape), sound)
     assert fed(knocks) == fed(sound) == []
 
