@@ -24,7 +24,7 @@ PURPOSES = {
     "fleet": "`fieldcal fleet` on many machines (Dask), and recordings in an object store",
     "sound": "driver sound-card (needs PortAudio besides)",
     "mcc": "drivers mcc172 and mcc-usb (need libdaqhats and libuldaq besides)",
-    "mqtt": "driver mqtt (needs an MQTT broker besides)",
+    "mqtt": "driver mqtt, and results to an MQTT broker (needs a broker besides)",
     "ni": "driver ni (needs NI-DAQmx besides; x86_64 only)",
 }
 WHEELS = Path(sys.prefix) / "wheels"  # where an installation without network keeps wheels of optional parts
