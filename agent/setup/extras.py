@@ -17,6 +17,7 @@ PURPOSES = {
     "files": "Parquet and Feather files, and large CSV files read faster",
     "hdf5": "HDF5 and MATLAB 7.3 files",
     "seismic": "MiniSEED and StationXML files",
+    "uff": "UFF files of `fieldcal export` (data set 58), for modal analysis",
     "tdms": "LabVIEW TDMS files",
     "endaq": "enDAQ and Slam Stick recordings (IDE)",
     "dcc": "check of digital calibration certificates against schemas (`fieldcal certificate --xsd`)",
