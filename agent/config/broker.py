@@ -34,6 +34,14 @@ def broker_faults(settings: Mqtt) -> Iterator[tuple[str, str]]:
             yield "tls", str(error)
 
 
+def broker_warning(settings: Mqtt) -> str:
+    """What is not good about the settings; "" where all is."""
+    here = settings.host == "localhost" or settings.host.startswith("127.") or settings.host == "::1"
+    if not settings.enabled or settings.password_file is None or settings.tls is not None or here:
+        return ""
+    return f"the password goes to {settings.host} not encrypted; add [mqtt.tls]"
+
+
 def read_password(path: Path) -> str:
     """The first line of the file. Raises KeyFileError, also where another user may read or write the file."""
     try:

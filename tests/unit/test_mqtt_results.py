@@ -16,7 +16,7 @@ import pytest
 from pydantic import ValidationError
 
 from agent.config import ConfigError, Mqtt, parse_config
-from agent.config.broker import tls_context
+from agent.config.broker import broker_warning, tls_context
 from agent.config.key_file import KeyFileError
 from agent.delivery.mqtt import FLYING_MAX, MqttPublisher
 from agent.delivery.store import Store
@@ -220,6 +220,14 @@ def test_tls_with_the_right_and_with_another_authority(tmp_path: Path, make: Mak
         secure.kill()
 
 
+@pytest.mark.parametrize(("host", "tls", "warned"), [("192.0.2.1", False, True), ("192.0.2.1", True, False),
+                                                     ("127.0.0.1", False, False)])  # fmt: skip
+def test_a_password_without_tls_is_told(host: str, tls: bool, warned: bool) -> None:
+    settings = Mqtt.model_validate({"enabled": True, "host": host, "username": "u", "password_file": "p",
+                                    **({"tls": {"ca": "c"}} if tls else {})})  # fmt: skip
+    assert ("not encrypted; add [mqtt.tls]" in broker_warning(settings)) == warned
+
+
 def test_what_answers_and_is_no_broker_is_told(make: Make, broker: Broker) -> None:
     import socket
     import threading
@@ -321,7 +329,9 @@ def test_home_assistant_finds_entities_whose_templates_give_the_results(broker: 
     assert states["problem"] == "ON"
     assert states["status"] == "HELD"
     assert states["calibrated"] == "2023-11-14T22:13:20+00:00"
-    assert (float(states["Sxx"]), float(states["U(Sxx)"]), float(states["Qz"])) == (26154.0, 12.0, 250.0)
+    S = [26154.0, 120.0, 50.0, -195.0, 26123.0, 67.0, -81.0, 87.0, 26295.0]
+    assert [float(states[name]) for name in PARAMETERS] == [*S, 250.0, 250.0, 250.0]
+    assert [float(states[f"U({name})"]) for name in PARAMETERS[:11]] == [12.0] * 11
     assert states["U(Qz)"] == "None"  # unknown
     by_name = {config["name"]: config for config in found.values()}
     assert [by_name[n].get("unit_of_measurement") for n in ("Sxx", "Qz")] == ["count/(m/s²)", "count"]
