@@ -215,7 +215,7 @@ def _rows(directory: Path, ending: str, count: int, axes: int) -> Iterator[str]:
     took_s, peak, worst = calibrate(sensor, reference, pose_options(directory, count, axes))
     yield _row(f"| calibrate | {ending} | {axes} | {count} | {size:.3g} | {took_s:.0f} | {peak:.0f} | {worst:.2f} |")
     if ending == "mcap":
-        for to in ("samples.parquet", "samples.csv", "samples.wav", "plots.mcap"):
+        for to in ("samples.parquet", "samples.csv", "plots.mcap"):
             option = "--mcap" if to.startswith("plots") else "--to"
             took_s, peak, _ = measured(["export", str(sensor), option, str(directory / to)])
             yield _row(

@@ -24,6 +24,7 @@ from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
 from agent.delivery.gateway_key import GatewayKey
 from agent.delivery.history import Record, StoreError
+from agent.delivery.mqtt import MqttPublisher
 from agent.delivery.publication import Publisher
 from agent.delivery.retention import keep_results
 from agent.delivery.store import Store
@@ -110,9 +111,10 @@ class Service:
         readers = [reader_of(device, events) for device in config.devices]
         self._reception = self._command_reception(events)
         self._publisher = self._publication()
+        self._mqtt = self._mqtt_publication()
         self._begin()
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
-        plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher)
+        plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher, self._mqtt)
         self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, Notifier(os.environ))
         for channel in config.channels:
             self._supervisor.remember(plant.outbox.drifts(channel.sensor))
@@ -136,6 +138,8 @@ class Service:
             recorded = writer.close()
             if self._publisher is not None:
                 self._publisher.close()
+            if self._mqtt is not None:
+                self._mqtt.close()
             if recorded:
                 self._end_store(writer.whole)
 
@@ -158,6 +162,14 @@ class Service:
             tls=zenoh.tls.files if zenoh.tls else None,
             serve=self._reception.serve if self._reception else None,
         )
+        publisher.start()
+        return publisher
+
+    def _mqtt_publication(self) -> MqttPublisher | None:
+        if not self._config.mqtt.enabled:
+            return None
+        gateway = self._config.gateway
+        publisher = MqttPublisher(gateway.site, gateway.name, self._config.mqtt, self._store.history)
         publisher.start()
         return publisher
 
@@ -256,7 +268,7 @@ class Service:
     def _deliver(
         self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]
     ) -> None:
-        """Put results into the store, then give them to the publisher. The recording's thread calls this."""
+        """Put results into the store, then give them to the publishers. The recording's thread calls this."""
         path = self._recorder.path if recorded else None
         name, epoch = final_name(path) if path else "", self._store.epoch
         signed = [self._recorder.results.signed(event_sequence, result) for result in results]
@@ -274,9 +286,10 @@ class Service:
             )
         if self._publisher is None:
             self._store.mark_published(records[-1].sequence)  # publication is off: no result waits for it
-            return
-        for record in records:
-            self._publisher.publish(record)
+        for sink in (self._publisher, self._mqtt):
+            if sink is not None:
+                for record in records:
+                    sink.publish(record)
 
 
 def refusals(channels: Sequence[Channel], refused: Mapping[str, str]) -> list[str]:

@@ -12,6 +12,7 @@ import click
 
 from agent.bench.plan_told import shortcomings
 from agent.config import Config, ConfigError
+from agent.config.broker import broker_warning
 from agent.config.faults import shown
 from agent.config.reading import parse_config, read_toml, refused
 from agent.config.tls import expiry_warning
@@ -101,6 +102,8 @@ def _warnings(path: Path, config: Config) -> Iterator[str]:
     now = datetime.now(UTC)
     if config.zenoh.tls and (warning := expiry_warning(config.zenoh.tls.files, now)):
         yield f"{path}: zenoh.tls.{warning}"
+    if warning := broker_warning(config.mqtt):
+        yield f"{path}: mqtt: {warning}"
     yield from (f"{path}: {warning}" for warning in signing_key_warnings(config))
     loaded = loaded_options(config)
     for i, options in enumerate(loaded.values()):

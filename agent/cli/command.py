@@ -13,7 +13,7 @@ import msgspec
 from agent.cli.tls_options import tls_files, tls_options
 from agent.commanding.arguments import Arguments, Verb, parse_arguments
 from agent.commanding.desk import LONGEST_VALIDITY_S
-from agent.commanding.envelope import Order, seal
+from agent.commanding.envelope import Order, as_line, seal
 from agent.commanding.local import LocalAgent
 from agent.commanding.refusal import Refused
 from agent.commanding.sending import send
@@ -38,7 +38,10 @@ _OPTIONS: list[Callable[[Callable[..., Any]], Callable[..., Any]]] = [
     click.option("--data-dir", type=click.Path(path_type=Path), default=Path("data"), show_default=True,
                  help="Data directory of this machine's agent; unused with --connect."),
     click.option("--connect", multiple=True, metavar="ENDPOINT", help="Zenoh router that passes the command on."),
-    click.option("--gateway", metavar="SITE/NAME", help="The gateway that the command is for; needed with --connect."),
+    click.option("--gateway", metavar="SITE/NAME",
+                 help="The gateway that the command is for; needed with --connect and --print."),
+    click.option("--print", "printed", is_flag=True,
+                 help="Print the signed command as one line, to paste into the fleet page, instead of sending it."),
     tls_options,
     click.option("--valid", "valid_s", type=click.FloatRange(1, LONGEST_VALIDITY_S), default=VALID_S,
                  show_default=True, metavar="S", help="Seconds in which the command must arrive; later it is refused."),
@@ -114,6 +117,7 @@ def _run(
     data_dir: Path,
     connect: tuple[str, ...],
     gateway: str | None,
+    printed: bool,
     ca: str | None,
     certificate: str | None,
     certificate_key: str | None,
@@ -129,11 +133,16 @@ def _run(
         key = read_signing_key(key_file)
     except (Refused, KeyFileError) as error:
         raise click.UsageError(str(error)) from None
+    if printed and connect:
+        raise click.UsageError("--print sends nothing; leave --connect out")
     files = tls_files(connect, ca, certificate, certificate_key)
 
     def sealed(to: str) -> bytes:
         return _sealed(key, to, sensor, verb, arguments, valid_s)
 
+    if printed:
+        say(as_line(sealed(_gateway_name(gateway))))
+        return 0
     address = f"{sensor}/command/{verb}"
     try:
         if connect:
@@ -157,7 +166,7 @@ def _run(
 
 def _gateway_name(gateway: str | None) -> str:
     if gateway is None:
-        raise click.UsageError("--connect needs --gateway SITE/NAME, since a command is signed for one gateway only")
+        raise click.UsageError("--connect and --print need --gateway SITE/NAME, since a command is for one gateway")
     site, _, name = gateway.partition("/")
     if not (CHUNK.fullmatch(site) and CHUNK.fullmatch(name)):
         raise click.BadParameter(f"{gateway!r} does not have the form SITE/NAME", param_hint="--gateway")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from agent.export.samples import Content
     from agent.export.smoothing import Smoothed
 
-ENDINGS = (".csv", ".parquet", ".wav", ".mseed")
+ENDINGS = (".csv", ".parquet", ".uff", ".mseed")
 NUMBERED = ENDINGS[:2]  # the formats that can name a calibration for each sample
 EPOCHS = ".xml"  # has no samples
 
@@ -30,7 +30,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "--to",
     type=_FILE,
     metavar="FILE",
-    help="Table of samples: .csv, .parquet, .wav or .mseed; with --corrected also .xml: the epochs of S and Q as "
+    help="Table of samples: .csv, .parquet, .uff or .mseed; with --corrected also .xml: the epochs of S and Q as "
     "StationXML. It must not exist.",
 )
 @click.option("--mcap", type=_FILE, metavar="FILE", help="Topics of ROS 2 for plot programs; it must not exist.")
@@ -128,10 +128,11 @@ def _write(recordings: Sequence[Path], content: Content, to: Path | None, mcap: 
     from agent.export.plots import write_plots
     from agent.export.samples import samples
     from agent.export.seismic import write_mseed
-    from agent.export.tables import write_csv, write_parquet, write_wav
+    from agent.export.tables import write_csv, write_parquet
+    from agent.export.uff import write_uff
 
     if to is not None:
-        writers = write_csv, write_parquet, write_wav, write_mseed
+        writers = write_csv, write_parquet, write_uff, write_mseed
         rows = dict(zip(ENDINGS, writers, strict=True))[to.suffix](to, content, samples(recordings, content))
         say(f"{to}: {rows} samples of {content.device}")
     if mcap is not None:

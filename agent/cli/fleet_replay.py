@@ -23,7 +23,7 @@ from agent.terminal.text import say
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE",
               help="Recompute with another setting, such as channels.*.certificate.sensitivity*=0.996.")  # fmt: skip
 @click.option("--audit", "with_audit", is_flag=True, help="Check every byte too, as `fieldcal audit`.")
-@click.option("--export", "ending", type=click.Choice(["csv", "parquet", "wav", "mseed"]),
+@click.option("--export", "ending", type=click.Choice(["csv", "parquet", "uff", "mseed"]),
               help="Write the samples of each sensor into -o DIR, as `fieldcal export`; replay nothing.")  # fmt: skip
 @click.option("-o", "directory", metavar="DIR", type=click.Path(file_okay=False, path_type=Path),
               help="Write the results here, and go on from what is here already.")  # fmt: skip

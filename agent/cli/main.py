@@ -25,7 +25,7 @@ COMMANDS = {
     "convert": ("agent.cli.convert", "Write a recorded file of another format as CSV."),
     "export": (
         "agent.cli.export",
-        "Write samples of recordings for other programs: CSV, Parquet, WAV, MiniSEED, plots.",
+        "Write samples of recordings for other programs: CSV, Parquet, UFF, MiniSEED, plots.",
     ),
     "replay": ("agent.cli.replay", "Run recordings through the same pipeline and print the calibrations."),
     "audit": ("agent.cli.audit", "Check recordings: every byte, and that the results follow from the data."),

@@ -84,5 +84,16 @@ def parse_envelope(data: bytes) -> Envelope:
     return Envelope(head[1].decode(), b64decode(head[2]), data[head.end() :])
 
 
+def as_line(data: bytes) -> str:
+    """The bytes of a command as one line of text, which a person can copy."""
+    return data.decode().replace("\n", " ", 1)
+
+
+def from_line(line: bytes) -> bytes:
+    """The bytes of a command from its line, with any white space around the line and before the body."""
+    head, brace, body = line.strip().partition(b"{")
+    return head.rstrip() + b"\n" + brace + body
+
+
 def _signed(key_id: str, body: bytes) -> bytes:
     return b" ".join([_MARK, key_id.encode()]) + b"\n" + body

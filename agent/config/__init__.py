@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from agent.config.pose import PoseInterval
     from agent.config.reading import ConfigError, load_config, parse_config
     from agent.config.recorded import recorded_config
-    from agent.config.sinks import Recording, Results, Tls, Zenoh
+    from agent.config.sinks import Mqtt, Recording, Results, Tls, Zenoh
     from agent.config.supervision import Metrics, Supervision
     from agent.config.whole import Config
 
 __all__ = [
-    "Channel", "CommandKey", "Commands", "Config", "ConfigError", "Device", "Gateway", "Metrics", "PoseInterval",
-    "Recording", "Results", "Supervision", "Tls", "Zenoh",
+    "Channel", "CommandKey", "Commands", "Config", "ConfigError", "Device", "Gateway", "Metrics", "Mqtt",
+    "PoseInterval", "Recording", "Results", "Supervision", "Tls", "Zenoh",
     "load_config", "parse_config", "recorded_config",
 ]  # fmt: skip
 
@@ -31,7 +31,7 @@ _PLACES = {
     "pose": ("PoseInterval",),
     "reading": ("ConfigError", "load_config", "parse_config"),
     "recorded": ("recorded_config",),
-    "sinks": ("Recording", "Results", "Tls", "Zenoh"),
+    "sinks": ("Mqtt", "Recording", "Results", "Tls", "Zenoh"),
     "supervision": ("Metrics", "Supervision"),
     "whole": ("Config",),
 }

@@ -9,13 +9,14 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from agent.config.broker import broker_faults
 from agent.config.certified import filled_in
 from agent.config.filters import FiltersError, filters_of
 from agent.config.key_file import KeyFileError, load_private_key
 from agent.config.known_keys import read_known_keys
 from agent.config.lines import Path
 from agent.config.names import Told, name_faults
-from agent.config.sinks import Tls
+from agent.config.sinks import Mqtt, Tls
 from agent.config.tls import tls_faults
 from agent.config.whole import Config
 from agent.config.words import in_words, length_fault, may_be_truth, meant
@@ -126,6 +127,7 @@ def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
             read_known_keys(FilePath(revoked))
         except KeyFileError as error:
             yield ("commands", "revoked_keys"), str(error)
+    yield from _mqtt_faults(raw.get("mqtt"))
     try:
         files = Tls.model_validate(zenoh.get("tls") if isinstance(zenoh, Mapping) else None).files
     except ValidationError:
@@ -133,6 +135,15 @@ def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
     for fault in tls_faults(files):
         field, _, what = fault.partition(": ")
         yield ("zenoh", "tls", field), what
+
+
+def _mqtt_faults(raw: object) -> Iterator[Told]:
+    try:
+        settings = Mqtt.model_validate(raw)
+    except ValidationError:
+        return  # the section's own check names it, if it is there at all
+    if settings.enabled:
+        yield from ((("mqtt", field), what) for field, what in broker_faults(settings))
 
 
 def _misread(value: Any, path: Path, kind: type[BaseModel]) -> Iterator[Told]:

@@ -1,4 +1,4 @@
-"""Settings of the recording, the store of results and the network."""
+"""Settings of the recording, the store of results, the network and the MQTT broker."""
 
 from __future__ import annotations
 
@@ -6,12 +6,31 @@ import re
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import ByteSize, Field, model_validator
+from pydantic import AfterValidator, ByteSize, Field, model_validator
 
 from agent.config.section import Endpoint, Section
 from agent.config.tls import TlsFiles
 
+_HOST = re.compile(r"[^\s/\x00]{1,255}")
 _SECRET = re.compile("key|password|secret|token", re.IGNORECASE)  # searched in the part of an endpoint after '#'
+
+
+def _topic(value: str) -> str:
+    if set(value) & set("+#") or not value.isprintable() or value.startswith("$") or not all(value.split("/")):
+        raise ValueError(
+            "a topic is one or more names with / between them, without +, # and control characters, and not $ at the "
+            "front, as in fieldcal/v1"
+        )
+    return value
+
+
+def _host(value: str) -> str:
+    if not _HOST.fullmatch(value):
+        raise ValueError("give the name or address alone, as in broker.example.org; the port is a setting of its own")
+    return value
+
+
+Topic = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(_topic)]
 
 
 class Recording(Section):
@@ -93,4 +112,43 @@ class Zenoh(Section):
                     f"connect: {place}#... contains a key or password, which every recording would store with the "
                     "configuration; give files in zenoh.tls instead"
                 )
+        return self
+
+
+class MqttTls(Section):
+    """Paths of the PEM files for TLS with a broker; the paths are not secret. The system's authorities are not used."""
+
+    ca: Annotated[Path, Field(description="certificates of which one must have signed the broker's")]
+    certificate: Annotated[Path | None, Field(description="of this gateway, if the broker asks for one")] = None
+    key: Annotated[Path | None, Field(description="its private key")] = None
+
+    @model_validator(mode="after")
+    def _both(self) -> MqttTls:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together; give both or none")
+        return self
+
+
+class Mqtt(Section):
+    """How the newest results are published to an MQTT broker (MQTT 5); needs the extra `mqtt`."""
+
+    enabled: bool = False
+    host: Annotated[str, AfterValidator(_host), Field(description="name or address of the broker")] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535, description="8883 is usual with TLS")] = 1883
+    topic: Annotated[Topic, Field(description="topics are <topic>/<site>/<gateway>/<sensor>/<what>")] = "fieldcal/v1"
+    client_id: Annotated[
+        str | None, Field(min_length=1, max_length=200, description="by default fieldcal-<site>-<gateway>")
+    ] = None
+    username: Annotated[str | None, Field(min_length=1, max_length=1000)] = None
+    password_file: Annotated[Path | None, Field(description="its first line is the password; mode 0600")] = None
+    tls: MqttTls | None = None
+    home_assistant: Annotated[
+        Topic | None,
+        Field(description="prefix of Home Assistant's discovery, as homeassistant; none: it is off"),
+    ] = None
+
+    @model_validator(mode="after")
+    def _fits(self) -> Mqtt:
+        if self.password_file is not None and self.username is None:
+            raise ValueError("password_file: a password needs a username; add it")
         return self

@@ -11,7 +11,7 @@ from agent.config.commands import Commands
 from agent.config.devices import Device, Gateway
 from agent.config.names import name_faults
 from agent.config.section import Section
-from agent.config.sinks import Recording, Results, Zenoh
+from agent.config.sinks import Mqtt, Recording, Results, Zenoh
 from agent.config.supervision import Supervision
 
 
@@ -25,6 +25,7 @@ class Config(Section):
     recording: Recording = Recording()
     results: Results = Results()
     zenoh: Zenoh = Zenoh()
+    mqtt: Mqtt = Mqtt()
     commands: Commands = Commands()
     supervision: Supervision = Supervision()
 

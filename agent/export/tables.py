@@ -1,11 +1,9 @@
-"""Tables of samples: CSV, Parquet, WAV. Each is written piece by piece, so memory does not grow with the length."""
+"""Tables of samples: CSV, Parquet. Each is written piece by piece, so memory does not grow with the length."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +14,6 @@ from calib.model import Array
 
 QUANTITIES = {"m/s2": "a", "m/s": "v", "m": "d"}  # name of the column of a uniaxial device, by its unit
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet would calculate
-LARGEST_WAV = 0xFFFFFFFF - 4096  # bytes: its sizes have 32 bits
-LONGEST_HOLE = 1_000_000  # samples that are filled up in a WAV file
-WAV_FLOAT = 3
 
 
 def names_of(content: Content) -> list[str]:
@@ -84,39 +79,6 @@ def write_parquet(path: Path, content: Content, blocks: Iterable[Samples]) -> in
             writer.write_table(pa.table(arrays, schema=schema))
             rows += len(values)
     return rows
-
-
-def write_wav(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
-    """Write a channel of 64-bit floating-point numbers for each column; a lost sample is a frame of NaN.
-
-    The rate is that of the clock, rounded to whole Hz, as the format wants it. Raises ExportError.
-    """
-    channels, frames, following, rate_hz = len(names_of(content)), 0, None, 0.0
-    with new_file(path) as file:
-        _wav_head(file, channels, 1, 0)
-        for block in blocks:
-            hole = 0 if following is None else max(block.first_index - following, 0)
-            if hole > LONGEST_HOLE:
-                raise ExportError(
-                    f"{path}: {hole} samples are missing in one place; WAV has no times; write it as .csv"
-                )
-            values = np.vstack([np.full((hole, channels), np.nan), columns(content, block)])
-            if (frames + len(values)) * channels * 8 > LARGEST_WAV:
-                raise ExportError(
-                    f"{path}: a WAV file has 4 GB at most; export fewer recordings at once, or to .parquet"
-                )
-            file.write(values.astype("<f8").tobytes())
-            frames, following, rate_hz = frames + len(values), block.first_index + len(block.values), block.rate_hz
-        file.seek(0)
-        _wav_head(file, channels, max(round(rate_hz), 1), frames)
-    return frames
-
-
-def _wav_head(file: BinaryIO, channels: int, rate_hz: int, frames: int) -> None:
-    frame = channels * 8
-    size = frames * frame
-    form = struct.pack("<4sIHHIIHH", b"fmt ", 16, WAV_FLOAT, channels, rate_hz, rate_hz * frame, frame, 64)
-    file.write(struct.pack("<4sI4s", b"RIFF", 36 + size, b"WAVE") + form + struct.pack("<4sI", b"data", size))
 
 
 def columns(content: Content, block: Samples) -> Array:

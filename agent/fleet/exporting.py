@@ -12,10 +12,11 @@ import msgspec
 
 from agent.export.samples import Content, content_of, samples, sensors_of
 from agent.export.seismic import write_mseed
-from agent.export.tables import write_csv, write_parquet, write_wav
+from agent.export.tables import write_csv, write_parquet
+from agent.export.uff import write_uff
 
 Write = Callable[..., int]
-WRITE: dict[str, Write] = {"csv": write_csv, "parquet": write_parquet, "wav": write_wav, "mseed": write_mseed}
+WRITE: dict[str, Write] = {"csv": write_csv, "parquet": write_parquet, "uff": write_uff, "mseed": write_mseed}
 
 
 class Exported(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""Forwards commands from the page to the gateways. They are signed in the browser; the server has no key."""
+"""Forwards signed commands from the page to the gateways. Neither the page nor the server has a key."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from starlette.responses import JSONResponse, Response
 
 from agent.commanding.allowance import Allowance
 from agent.commanding.arguments import VERBS
-from agent.commanding.envelope import LARGEST, parse_envelope
+from agent.commanding.envelope import LARGEST, from_line, parse_envelope
 from agent.commanding.refusal import Refused
 from agent.commanding.sending import send
 from agent.config.tls import TlsFiles
@@ -40,14 +40,14 @@ class Forwarding:
         self._at_once = anyio.CapacityLimiter(AT_ONCE)
 
     async def command(self, request: Request) -> Response:
-        """POST of the bytes of a command; the query names site, gateway, sensor and verb.
+        """POST of a signed line of `fieldcal command --print`; the query names site, gateway, sensor and verb.
 
         The answer is that of the gateway, 200 with `taken` and `reason`; 502 where nobody answers.
         """
         asked = request.query_params
         site, gateway, sensor, verb = (asked.get(name, "") for name in ("site", "gateway", "sensor", "verb"))
         user = self._access.commanding(request, verb)
-        data = await body_of(request, LARGEST)
+        data = from_line(await body_of(request, LARGEST))
         if verb not in VERBS or not all(map(CHUNK.fullmatch, (site, gateway, sensor))):
             raise HTTPException(400, "not the address of a command")
         try:

@@ -79,10 +79,12 @@ def back_up(data_dir: Path, target: Path, config_path: Path | None, keys: Iterab
 
 
 def key_files(config: Config) -> list[Path]:
-    """The key and certificate files that a configuration names."""
+    """The key, password and certificate files that a configuration names."""
     named = [config.recording.signing_key] if config.recording.signing_key else []
-    tls = config.zenoh.tls
-    return named + ([Path(tls.ca), Path(tls.certificate), Path(tls.key)] if tls else [])
+    tls, mqtt = config.zenoh.tls, config.mqtt
+    named += [Path(tls.ca), Path(tls.certificate), Path(tls.key)] if tls else []
+    of_broker = (mqtt.tls.ca, mqtt.tls.certificate, mqtt.tls.key) if mqtt.tls else ()
+    return named + [path for path in (mqtt.password_file, *of_broker) if path is not None]
 
 
 def left_out(data_dir: Path) -> list[str]:

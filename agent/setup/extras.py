@@ -17,6 +17,7 @@ PURPOSES = {
     "files": "Parquet and Feather files, and large CSV files read faster",
     "hdf5": "HDF5 and MATLAB 7.3 files",
     "seismic": "MiniSEED and StationXML files",
+    "uff": "UFF files of `fieldcal export` (data set 58), for modal analysis",
     "tdms": "LabVIEW TDMS files",
     "endaq": "enDAQ and Slam Stick recordings (IDE)",
     "dcc": "check of digital calibration certificates against schemas (`fieldcal certificate --xsd`)",
@@ -24,7 +25,7 @@ PURPOSES = {
     "fleet": "`fieldcal fleet` on many machines (Dask), and recordings in an object store",
     "sound": "driver sound-card (needs PortAudio besides)",
     "mcc": "drivers mcc172 and mcc-usb (need libdaqhats and libuldaq besides)",
-    "mqtt": "driver mqtt (needs an MQTT broker besides)",
+    "mqtt": "driver mqtt, and results to an MQTT broker (needs a broker besides)",
     "ni": "driver ni (needs NI-DAQmx besides; x86_64 only)",
 }
 WHEELS = Path(sys.prefix) / "wheels"  # where an installation without network keeps wheels of optional parts

@@ -22,6 +22,7 @@ from agent.core.events import (
     StatusChange,
     WindowReport,
 )
+from agent.delivery.mqtt import MqttState
 from agent.supervision.devices import DeviceHealth, DeviceWatch
 from hw.block import SampleBlock
 from hw.sensor import load_driver
@@ -81,6 +82,7 @@ class Situation(msgspec.Struct, frozen=True, kw_only=True):
     publication: PublicationHealth
     disk_free_bytes: int | None
     process: ProcessHealth | None
+    mqtt: MqttState | None = None
 
 
 class InForce(msgspec.Struct, frozen=True, kw_only=True):
@@ -226,6 +228,7 @@ class Health:
             "the store cannot be read": publication.unpublished is None,
             "no Zenoh router, results wait in the store": publication.enabled and not publication.connected,
             f"publication: {publication.fault}": publication.fault,
+            f"MQTT: {now.mqtt.fault if now.mqtt else ''}": now.mqtt is not None and now.mqtt.fault,
             f"queue more than half full, the agent is too slow: {', '.join(behind)}": behind,
         }
         return [words for words, holds in told.items() if holds]

@@ -49,6 +49,9 @@ GATEWAY_METRICS: dict[str, tuple[str, bool, Callable[[GatewayStatus], Number]]] 
     "publication_connected": ("Whether a Zenoh router is connected", False, lambda s: s.publication.connected),
     "reopened_sessions": ("Zenoh sessions that the router did not hear", True, lambda s: s.publication.reopened),
     "unpublished_results": ("Stored results that are not published yet", False, lambda s: s.publication.unpublished),
+    "mqtt_connected": ("Whether the MQTT broker is connected", False, lambda s: s.mqtt.connected if s.mqtt else None),
+    "mqtt_superseded": ("Values replaced before MQTT sent them", True, lambda s: s.mqtt.superseded if s.mqtt else None),
+    "mqtt_refused": ("Values that the MQTT broker did not take", True, lambda s: s.mqtt.refused if s.mqtt else None),
     "threads": ("Threads of the agent", False, lambda s: s.process.threads if s.process else None),
 }
 

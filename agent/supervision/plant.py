@@ -11,6 +11,7 @@ from typing import Protocol
 
 from agent.core.events import DriftReport
 from agent.delivery.history import StoreError
+from agent.delivery.mqtt import MqttPublisher
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from agent.recording.thread import CAPACITY, RecordingThread
@@ -85,6 +86,7 @@ class Plant:
     recorder: Recorder
     outbox: Outbox
     publisher: Publisher | None
+    mqtt: MqttPublisher | None
 
     def situation(self) -> Situation:
         """Measure the present situation. Takes half a millisecond."""
@@ -104,6 +106,7 @@ class Plant:
             publication=self._publication(),
             disk_free_bytes=_disk_free_bytes(self.data_dir),
             process=_process(),
+            mqtt=self.mqtt.state() if self.mqtt is not None else None,
         )
 
     def _publication(self) -> PublicationHealth:

@@ -79,8 +79,9 @@ class Supervisor:
         status = self._health.status(now_ns, utc_ns, self._plant.situation(), state, reasons)
         self._newest = status
         self._notifier.status(status.line)
-        if self._plant.publisher is not None:
-            self._plant.publisher.tell_status(msgspec.json.encode(status))
+        for publisher in (self._plant.publisher, self._plant.mqtt):
+            if publisher is not None:
+                publisher.tell_status(msgspec.json.encode(status))
         if (state, reasons) != self._told:
             self._told = (state, reasons)
             tell("state", status.line, state == "degraded", state=state, reasons=reasons)

@@ -17,6 +17,7 @@ import zenoh
 from click.testing import CliRunner
 
 from agent.cli.monitor import monitor
+from agent.commanding.envelope import as_line
 from agent.commanding.network import serve_queries
 from agent.delivery.keys import gateway_key
 from agent.delivery.session import session_config
@@ -172,7 +173,7 @@ def test_a_session_ends_with_its_user_and_its_password(served: Served, users: Pa
 
 
 def test_a_signed_command_is_forwarded_and_the_gateway_decides(served: Served, desk: DeskSite) -> None:
-    anna, data = Browser(served), sealed()
+    anna, data = Browser(served), as_line(sealed()).encode() + b"\r\n"
     assert anna.command("hold", data).json == {"taken": True, "reason": ""}
     again = anna.command("hold", data).json  # the gateway's counter holds
     assert not again["taken"]
@@ -196,12 +197,13 @@ def test_commands_without_right_token_or_signature_do_not_reach_the_gateway(serv
         "without token": anna.command("hold", data, **{"X-CSRF-Token": ""}),
         "with bob's token": anna.command("hold", data, **{"X-CSRF-Token": bob.headers["X-CSRF-Token"]}),
         "not signed": anna.command("hold", b'{"verb": "hold"}'),
+        "nothing": anna.command("hold", b""),
         "too large": anna.command("hold", data + b" " * 4096),
         "wildcard": anna.command("hold", data, sensor="*"),
     }
     assert {what: answer.status for what, answer in refused.items()} == {
         "without login": 401, "without right": 403, "another verb": 403, "of another page": 400, "without token": 403,
-        "with bob's token": 403, "not signed": 400, "too large": 413, "wildcard": 400}  # fmt: skip
+        "with bob's token": 403, "not signed": 400, "nothing": 400, "too large": 413, "wildcard": 400}  # fmt: skip
     assert desk.events == []
 
 

@@ -6,11 +6,12 @@ import csv
 import json
 import re
 import struct
+import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from mcap.reader import make_reader
 
 from agent.calibrate.tables import read_sensor
 from agent.cli.main import run_cli
+from agent.export import uff
 from agent.export.plots import write_plots
-from agent.export.samples import Content, Samples, content_of, samples
+from agent.export.samples import Content, ExportError, Samples, content_of, samples
 from agent.export.tables import cell, write_csv
+from agent.export.uff import write_uff
 from agent.reading.ros2 import RosBag
 from hw.virtual.bench import Bench
 from hw.virtual.presets import plain
@@ -71,15 +74,97 @@ def test_a_table_has_times_indications_and_accelerations(
     np.testing.assert_allclose(a @ np.transpose(newest.sensitivity) + newest.offset, truth[1], rtol=1e-9, atol=1e-6)
 
 
-def test_wav_has_the_samples_as_numbers_of_64_bits(
+def uff_sets(path: Path) -> list[tuple[list[str], list[float]]]:
+    """The sets 58 of a file by the places of the format, without pyuff: (the 11 lines of the head, the numbers)."""
+    sets = path.read_text("ascii").split("    -1\n")[1::2]
+    assert all(lines.startswith((f"{164:6d}", f"{58:6d}")) for lines in sets)
+    found = []
+    for lines in (one.split("\n") for one in sets if one.startswith(f"{58:6d}")):
+        numbers = [float(line[at : at + 20]) for line in lines[12:] for at in range(0, len(line), 20)]
+        found.append((lines[1:12], numbers))
+    return found
+
+
+def test_uff_has_each_signal_with_unit_direction_and_times(
     recorded: Path, truth: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "out.wav"
+    pyuff = pytest.importorskip("pyuff", reason="pyuff is not installed (extra uff)")
+    path = tmp_path / "out.uff"
     assert run(capsys, recorded, "--to", path) == (0, "")
-    np.testing.assert_array_equal(read_sensor(path, columns="time=time_s,x=ch1,y=ch2,z=ch3").v[:], truth[1])
-    channels, rate_hz = struct.unpack_from("<HI", path.read_bytes(), 22)
-    assert channels == 6
-    assert rate_hz == round((len(truth[0]) - 1) / (truth[0][-1] - truth[0][0]))
+    times, indications = truth
+    newest = content_of([recorded], None).calibrations[-1]
+    a = np.linalg.solve(np.array(newest.sensitivity), (indications - newest.offset).T).T
+    wanted = np.hstack([indications, a])
+    sets = uff_sets(path)
+    assert len(sets) == 6
+    for k, (head, numbers) in enumerate(sets):
+        np.testing.assert_allclose(numbers, wanted[:, k], rtol=1e-11, atol=1e-11)
+        assert head[0].rstrip() == f"mems {('vx', 'vy', 'vz', 'ax', 'ay', 'az')[k]}"
+        assert head[2].rstrip() == f"{datetime.fromtimestamp(times[0], UTC):%d-%b-%y %H:%M:%S}".upper()
+        # Record 6, Format(2(I5,I10),2(1X,10A1,I10,I4)): function type, response entity, node and direction
+        assert (int(head[5][:5]), head[5][31:41].strip(), int(head[5][41:51])) == (1, "mems", 1)
+        assert int(head[5][51:55]) == k % 3 + 1
+        # Record 7, Format(3I10,3E13.5): real numbers of 64 bits, how many, equally spaced, begin, step
+        assert [int(head[6][at : at + 10]) for at in (0, 10, 20)] == [4, len(times), 1]
+        step_s = (times[-1] - times[0]) / (len(times) - 1)
+        assert float(head[6][30:43]) == 0.0
+        assert float(head[6][43:56]) == pytest.approx(step_s, rel=6e-6)
+        # Records 8 and 9, Format(I10,3I5,2(1X,20A1)): type, label, unit of abscissa and ordinate
+        assert (int(head[7][:10]), head[7][26:46].strip(), head[7][47:67].strip()) == (17, "Time", "s")
+        told = (12, "Acceleration", "m/s2") if k > 2 else (0, "Indication", "count")
+        assert (int(head[8][:10]), head[8][26:46].strip(), head[8][47:67].strip()) == told
+        rate_hz = float(head[3].split("rate ")[1].split()[0])
+        assert rate_hz == pytest.approx(1.0 / step_s, rel=1e-6)
+    made = f"a = inv(S) (V - Q), calibration {newest.made[1]} of {newest.made[0]}"
+    assert [head[1].rstrip() for head, _ in sets] == ["indication"] * 3 + [made] * 3
+
+    units, *read = pyuff.UFF(str(path)).read_sets()
+    assert (units["type"], units["units_code"], units["length"]) == (164, 1, 1.0)
+    for k, one in enumerate(read):
+        np.testing.assert_allclose(one["data"], wanted[:, k], rtol=1e-11, atol=1e-11)
+        assert (one["rsp_dir"], one["ordinate_axis_units_lab"]) == (k % 3 + 1, "m/s2" if k > 2 else "count")
+        np.testing.assert_allclose(one["x"], times - times[0], atol=2e-4)  # the step has six digits
+
+
+def uff_blocks(*parts: tuple[int, int]) -> Iterator[Samples]:
+    """Blocks (number of the first sample, how many) of a steady device at 100 Hz, with a = its own number."""
+    for first, count in parts:
+        numbers = np.arange(first, first + count, dtype=float)
+        yield Samples(
+            (1_700_000_000 * 10**9 + numbers * 1e7).astype(np.int64), numbers[:, None], None, first, 100.0, None
+        )
+
+
+def test_a_set_of_uff_spans_no_hole_and_no_name_breaks_its_lines(tmp_path: Path) -> None:
+    pytest.importorskip("pyuff", reason="pyuff is not installed (extra uff)")
+    path = tmp_path / "holes.uff"
+    content = Content("a" * 63, "m/s²\n    -1\n", 1)
+    assert write_uff(path, content, uff_blocks((5, 3), (8, 2), (20, 1), (30, 4))) == 10
+    assert [(numbers, float(head[6][30:43]), head[4].rstrip()) for head, numbers in uff_sets(path)] == [
+        ([5.0, 6.0, 7.0, 8.0, 9.0], 0.0, "NONE"),
+        ([20.0], 0.15, "10 samples are missing before"),
+        ([30.0, 31.0, 32.0, 33.0], 0.25, "9 samples are missing before"),
+    ]
+    (head, _), *_ = uff_sets(path)
+    assert (head[5][31:41], int(head[5][51:55])) == ("a" * 10, 0)
+    assert all(len(line) <= 80 for line in head)
+    assert [one.name for one in tmp_path.iterdir()] == ["holes.uff"]
+
+
+@pytest.mark.parametrize("limit", ["MOST_SAMPLES", "MOST_PARTS"])
+def test_what_uff_cannot_hold_is_refused(limit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pyuff", reason="pyuff is not installed (extra uff)")
+    monkeypatch.setattr(uff, limit, 3)
+    blocks = uff_blocks((0, 4)) if limit == "MOST_SAMPLES" else uff_blocks(*((10 * k, 1) for k in range(4)))
+    with pytest.raises(ExportError, match="export fewer recordings at once, or to"):
+        write_uff(tmp_path / "a.uff", Content("a", "m/s2", 1), blocks)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_pyuff_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyuff", None)
+    with pytest.raises(ExportError, match="fieldcal extras --install uff"):
+        write_uff(tmp_path / "a.uff", Content("a", "m/s2", 1), [])
 
 
 def test_miniseed_has_each_block_at_its_own_time(
@@ -185,8 +270,8 @@ def test_the_reader_of_ros_2_reads_the_accelerations(plots: Path) -> None:
     np.testing.assert_allclose(table, told, rtol=1e-15)
 
 
-def test_layouts_show_what_is_there(plots: Path) -> None:
-    """Every curve of the layouts for Lichtblick and PlotJuggler is a number of a message."""
+def test_the_layout_shows_what_is_there(plots: Path) -> None:
+    """Every curve of the layout for Lichtblick is a number of a message."""
     newest = {topic: content for topic, _, content in messages(plots)}
     layout = json.loads((VIEWERS / "lichtblick.json").read_text())
     shown = [path["value"] for panel in layout["configById"].values() for path in panel["paths"]]
@@ -197,13 +282,6 @@ def test_layouts_show_what_is_there(plots: Path) -> None:
         for part in re.findall(r"\w+", rest):
             value = value[int(part)] if part.isdigit() else value[part]
         assert isinstance(value, float)
-    curves = [str(curve.get("name")) for curve in ET.parse(VIEWERS / "plotjuggler.xml").iter("curve")]
-    assert len(curves) == 9
-    for curve in curves:
-        topic, rest = re.fullmatch(r"(/\w+/\w+)/(.*)", curve).groups()  # type: ignore[union-attr]
-        first, second = rest.split("/")
-        held = newest[topic]
-        assert second in held[first] if first in held else first in held["name"] and second == "position"
     panels = re.findall(r'"(Plot!\w+)"', json.dumps(layout["layout"]))
     assert sorted(panels) == sorted(layout["configById"])
 
@@ -211,7 +289,7 @@ def test_layouts_show_what_is_there(plots: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--to", "out.xyz"], "must be one of .csv, .parquet, .wav, .mseed"),
+        (["--to", "out.xyz"], "must be one of .csv, .parquet, .uff, .mseed"),
         ([], "add --to FILE"),
         (["--to", "out.csv", "--device", "nobody"], "has no samples of 'nobody'"),
         (["--to", "there.csv"], "the file exists"),

@@ -180,7 +180,7 @@ def test_what_cannot_be_measured_or_is_turned_off_is_no_fault() -> None:
 def test_it_is_one_flat_object_of_json_without_nan() -> None:
     told = json.loads(msgspec.json.encode(report(opened(block("mems", 0)), 1.0)))
     assert {"site", "gateway", "state", "reasons", "advice", "devices", "sensors", "queues", "recording", "publication",
-            "disk_free_bytes", "process", "uptime_s", "run_id", "version", "t_utc_ns"} == set(told)  # fmt: skip
+            "disk_free_bytes", "process", "mqtt", "uptime_s", "run_id", "version", "t_utc_ns"} == set(told)  # fmt: skip
     assert told["devices"]["reference"]["clock"] is None
 
 

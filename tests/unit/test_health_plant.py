@@ -31,7 +31,7 @@ def plant(data_dir: Path, store: Store, **parts: Any) -> Plant:
     publisher = SimpleNamespace(state=lambda: SimpleNamespace(connected=True, fault="", reopened=0))
     found: dict[str, Any] = {
         "events": EventQueue(2), "writer": SimpleNamespace(waiting=3), "recorder": recorder, "publisher": publisher,
-        "outbox": Outbox(store),
+        "outbox": Outbox(store), "mqtt": None,
     } | parts  # fmt: skip
     return Plant(data_dir, **found)
 

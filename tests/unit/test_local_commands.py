@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from agent.cli.command import command
+from agent.commanding.envelope import from_line, parse_envelope
 from agent.commanding.local import SOCKET_NAME, LocalAgent, LocalDoor
 from agent.keys.files import SigningKey, write_new
 from tests.unit.command_desk import ANNA, GATEWAY, DeskSite, sealed
@@ -49,6 +51,18 @@ def test_the_command_line_sends_what_the_desk_takes(site: DeskSite) -> None:
     assert (refused.return_value, refused.stderr) == (3, "refused: key anna has no right to send accept to mems\n")
     elsewhere = run(site, "hold", "--sensor", "mems", "--gateway", "workshop/gateway-2")
     assert (elsewhere.return_value, "it is for 'workshop/gateway-2'" in elsewhere.stderr) == (3, True)
+
+
+def test_a_signed_line_is_printed_and_sends_nothing(site: DeskSite) -> None:
+    for arguments in (["hold"], ["rollback", "--sequence", "101"]):
+        line = run(site, *arguments, "--sensor", "mems", "--gateway", GATEWAY, "--print").stdout
+        assert site.events == []
+        assert line.count("\n") == 1
+        for pasted in (line, f" {line.rstrip()}\r\n", line.replace(" {", "\r\n{", 1)):
+            assert parse_envelope(from_line(pasted.encode())).open(ANNA.public_key()).verb == arguments[0]
+    for wrong in (["--print"], ["--print", "--gateway", GATEWAY, "--connect", "tcp/127.0.0.1:1"]):
+        refused = run(site, "hold", "--sensor", "mems", *wrong)
+        assert re.search("need --gateway SITE/NAME|leave --connect out", str(refused.exception)), refused
 
 
 def test_who_may_use_the_socket_is_a_matter_of_its_group(site: DeskSite) -> None:

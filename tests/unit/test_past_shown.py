@@ -335,7 +335,7 @@ def test_what_cannot_be_corrected_is_refused_with_a_remedy(
 ) -> None:
     to = tmp_path / "a.csv"
     for arguments, words in (
-        (["-o", tmp_path / "a.wav"], "--corrected writes one file with the ending .csv or .parquet"),
+        (["-o", tmp_path / "a.uff"], "--corrected writes one file with the ending .csv or .parquet"),
         (["-o", to, "--device", "reference"], "reference has 1 axis; S and Q are those of three axes"),
         (["-o", to, "--device", "other"], "has no samples of 'other'"),
     ):

@@ -1,6 +1,5 @@
-// Commands to one sensor: a dialog shows the command line, or signs and sends the command for those with the right.
+// Commands to one sensor: a dialog shows the command line, and forwards a signed line for users with the right.
 import { $, make, text } from "./common.js";
-import * as signing from "./signing.js";
 
 const WHAT = {
   accept: "The estimate comes into force.",
@@ -14,44 +13,44 @@ export const setUser = (told) => { me = told; };
 
 const OPTIONS = { theta_deg: "theta-deg", alpha_deg: "alpha-deg", direction: "direction", gravity_mps2: "gravity", position: "position", sequence: "sequence" };
 
-export function commandLine(order) {
+export function commandLine(order, way) {
   const given = Object.entries(order.arguments).map(([name, value]) => (name === "release" ? "--release" : `--${OPTIONS[name]} ${[value].flat().join(" ")}`));
-  return ["fieldcal command", order.verb, ...given, `--sensor ${order.sensor} --gateway ${order.gateway} --key KEY --connect ENDPOINT`].join(" ");
+  return ["fieldcal command", order.verb, ...given, `--sensor ${order.sensor} --gateway ${order.gateway} --key KEY ${way}`].join(" ");
 }
 
-async function keyList(chosen) {
-  const keys = signing.available() ? await signing.keys() : [];
-  return make("select", keys.map((key) => make("option", key.id, { value: key.id, selected: key.id === chosen })), { id: "key" });
-}
-
-async function send(order, id, told) {
+// Forwards a line of `fieldcal command ... --print`. The gateway verifies it; what it says is shown with the answer.
+async function send(order, line, told) {
   told.replaceChildren(text("sending"));
   try {
     const [site, gateway] = order.gateway.split("/");
     const address = new URLSearchParams({ site, gateway, sensor: order.sensor, verb: order.verb });
-    const answer = await fetch(`api/command?${address}`, { method: "POST", headers: { "X-CSRF-Token": me.token }, body: await signing.sign(order, id) });
+    const answer = await fetch(`api/command?${address}`, { method: "POST", headers: { "X-CSRF-Token": me.token }, body: line });
     const said = answer.ok ? await answer.json() : { taken: false, reason: await answer.text() };
-    told.replaceChildren(text(said.taken ? "taken by the gateway" : `refused: ${said.reason}`));
+    told.replaceChildren(text(said.taken ? `taken by the gateway: ${line.slice(line.indexOf("{"))}` : `refused: ${said.reason}`));
   } catch (error) {
     told.replaceChildren(text(`not sent: ${error.message}`));
   }
 }
 
+function pasting(order, told) {
+  const pasted = make("textarea", [], { id: "pasted", rows: "5", spellcheck: "false" });
+  return [make("p", make("label", ["Then paste the signed line that it prints: ", make("br"), pasted])),
+    make("p", make("button", "Send", { type: "button", click: () => send(order, pasted.value, told) }))];
+}
+
 // Opens the dialog for an order {gateway, sensor, verb, arguments}.
-export async function open(order) {
-  const told = make("p", [], { role: "status", id: "told" }), line = commandLine(order), keys = await keyList();
-  const may = me.verbs.includes(order.verb), ready = may && keys.options.length > 0;
-  const hint = !me.user ? "Log in to send it from here; or run this line on a machine with your key:"
-    : !may ? `${me.user} has no right to send ${order.verb} from here. With a key of your own, run:`
-      : !signing.available() ? "A browser signs only on pages of HTTPS or localhost. Run this line instead:"
-        : !ready ? "This browser has no key yet; make one under Keys. Or run this line:" : "Or run this line on a machine with your key:";
-  const button = make("button", "Sign and send", { type: "button", disabled: !ready, click: () => send(order, keys.value, told) });
+export function open(order) {
+  const may = me.verbs.includes(order.verb), line = commandLine(order, may ? "--valid 300 --print" : "--connect ENDPOINT");
+  const told = make("p", [], { role: "status", id: "told" });
+  const hint = !me.user ? "Run this line on a machine with your key. Users who log in can also send a signed line from here:"
+    : may ? "Run this line on a machine with your key; the signature is valid for 5 minutes:"
+      : `${me.user} has no right to send ${order.verb} from here. With a key of your own, run:`;
   $("order").replaceChildren(
     make("h2", `${order.arguments.release ? "release" : order.verb}: ${order.sensor} of ${order.gateway}`, { id: "order-title" }),
-    make("p", WHAT[order.arguments.release ? "release" : order.verb]),
-    ...(ready ? [make("p", [make("label", ["Key ", keys]), " ", button])] : []), told, make("p", hint), make("p", make("code", line)),
-    make("p", [make("button", "Copy", { type: "button", click: () => copy(line, told) }), " ",
-      make("button", "Close", { type: "button", click: () => $("order").close() })]));
+    make("p", WHAT[order.arguments.release ? "release" : order.verb]), make("p", hint), make("p", make("code", line)),
+    make("p", make("button", "Copy", { type: "button", click: () => copy(line, told) })),
+    ...(may ? pasting(order, told) : []), told,
+    make("p", make("button", "Close", { type: "button", click: () => $("order").close() })));
   $("order").showModal();
 }
 
@@ -101,31 +100,4 @@ export function poseForm(gateway, sensor) {
     }
   });
   return form;
-}
-
-// The keys of this browser.
-export async function keysSection() {
-  if (!signing.available()) return [make("p", "A browser signs only on pages of HTTPS or localhost.")];
-  const box = make("div"), told = make("p", [], { role: "status" });
-  const refresh = async () => {
-    const rows = (await signing.keys()).map((key) => make("li", [make("strong", key.id), " public key ", make("code", key.publicKey), " ",
-      make("button", `Forget ${key.id}`, { type: "button", click: () => act(() => signing.forget(key.id), `forgot ${key.id}`) })]));
-    box.replaceChildren(rows.length ? make("ul", rows) : make("p", "This browser has no key."));
-  };
-  const act = async (change, done) => {
-    try {
-      await change();
-      told.replaceChildren(text(done));
-    } catch (error) {
-      told.replaceChildren(text(error.name === "ConstraintError" ? "this browser has a key of this name already" : error.message));
-    }
-    file.value = "";
-    await refresh();
-  };
-  const id = make("input", [], { id: "new-key", size: "12" });
-  const file = make("input", [], { type: "file", id: "key-file", change: () => file.files[0] &&
-    act(async () => signing.keep(await signing.readKeyFile(await file.files[0].text())), "the key is kept; delete the file if nothing else needs it") });
-  const adds = make("button", "Make a key", { type: "button", click: () => act(async () => signing.keep(await signing.makeKey(id.value.trim())), "made; the gateway needs its public key in [[commands.keys]]") });
-  await refresh();
-  return [box, make("p", [make("label", ["Name ", id]), " ", adds]), make("p", make("label", ["or read a key file of `fieldcal keys command` ", file])), told];
 }

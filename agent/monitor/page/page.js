@@ -1,12 +1,12 @@
 // Which view is shown, who is logged in, and what changed.
 import { leaveBench, showBench } from "./bench.js";
 import { $, get, make, NeedsLogin, text, view } from "./common.js";
-import { keysSection, setUser } from "./commands.js";
+import { setUser } from "./commands.js";
 import { showEvents, showFleet, startFleet } from "./fleet.js";
 import { leaveSensor, showSensor, startSensor } from "./sensor.js";
 
-const VIEWS = ["fleet", "sensor", "bench", "events", "keys"];
-let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, loading = false, again = false, keysShown = false;
+const VIEWS = ["fleet", "sensor", "bench", "events"];
+let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, loading = false, again = false;
 
 function go(given) {
   const next = view();
@@ -19,7 +19,7 @@ async function show() {
   if (!told) return;
   const now = view(), chosen = now.has("sensor") ? "sensor" : VIEWS.includes(now.get("view")) ? now.get("view") : "fleet";
   for (const id of VIEWS) $(id).hidden = id !== chosen;
-  for (const id of ["fleet", "bench", "events", "keys"]) id === chosen ? $(`to-${id}`).setAttribute("aria-current", "page") : $(`to-${id}`).removeAttribute("aria-current");
+  for (const id of ["fleet", "bench", "events"]) id === chosen ? $(`to-${id}`).setAttribute("aria-current", "page") : $(`to-${id}`).removeAttribute("aria-current");
   document.title = `fieldcal: ${chosen === "sensor" ? now.get("sensor") : chosen}`;
   if (chosen !== "sensor") leaveSensor();
   if (chosen !== "bench") leaveBench();
@@ -27,9 +27,7 @@ async function show() {
     if (chosen === "sensor") await showSensor(told, go);
     else if (chosen === "bench") await showBench();
     else if (chosen === "events") showEvents(await get("api/events"));
-    else if (chosen === "keys" && !keysShown) $("key-rows").replaceChildren(...await keysSection());
     else if (chosen === "fleet") showFleet(told);
-    keysShown = chosen === "keys";
   } catch (error) {
     failed(error);
   }
