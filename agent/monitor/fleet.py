@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -32,7 +32,7 @@ class GatewayTold(msgspec.Struct, frozen=True):
 
     state: str
     reasons: list[str]
-    t_utc_ns: int
+    t_utc_ns: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     version: str = ""
 
 

@@ -187,7 +187,7 @@ async def body_of(request: Request, most: int) -> bytes:
 
 
 def _secure(request: Request) -> bool:
-    return request.url.scheme == "https"
+    return bool(request.scope["scheme"] == "https")
 
 
 def _cookie(request: Request) -> str:
