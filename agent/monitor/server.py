@@ -46,6 +46,7 @@ _NUMBER = re.compile(r"[0-9]{1,9}")
 LARGEST_PICTURE = 32 << 20  # bytes
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
+ALIVE_S = 15.0  # s between two comments, which keep proxies from ending the stream, and find clients that are gone
 
 
 def application(
@@ -190,16 +191,20 @@ class _Data:
 
     async def _tell(self) -> AsyncIterator[str]:
         me, told, benches = object(), -1, self._following.benches
-        guided = benches.version
+        guided, silent_s = benches.version, 0.0
         self._listeners.add(me)
         try:
             while not self._stopping.is_set():
+                silent_s += TELL_S
                 if self._fleet.version != told:
                     told = self._fleet.version
                     yield f"data: {told}\n\n"
                 if benches.version != guided:
                     guided = benches.version
                     yield f"event: bench\ndata: {guided}\n\n"
+                if silent_s >= ALIVE_S:
+                    silent_s = 0.0
+                    yield ": no change\n\n"
                 await asyncio.sleep(TELL_S)
         finally:
             self._listeners.discard(me)

@@ -122,7 +122,7 @@ def test_nothing_is_read_before_the_login_and_after_the_logout(served: Served) -
 
 
 def test_under_https_the_cookie_is_secure_and_of_this_host(site: Site, users: Path, tmp_path: Path) -> None:
-    with Served(site, tmp_path / "monitor", users=users) as served:
+    with Served(site, tmp_path / "monitor", users=users, behind_proxy=True) as served:
         body = json.dumps({"name": "anna", "password": PASSWORD})
         headers = {"Origin": f"https://{served.address}", "X-Forwarded-Proto": "https"}
         cookie = served.ask("/api/login", "POST", body, headers).headers["set-cookie"].lower()
