@@ -21,6 +21,7 @@ from agent.config.tls import TlsFiles
 from agent.delivery.asking import Asking
 from agent.delivery.hearing import Hearing
 from agent.delivery.holding import Held
+from agent.delivery.instances import Instances
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.memory import Memory
 from agent.delivery.presence import Presence
@@ -127,6 +128,8 @@ class Consumer:
             opened.callback(subscriber.undeclare)
             self._presence = Presence(session, self._key, lambda: self._inbox.put(_Wake.NEWS))
             opened.callback(self._presence.close)
+            self._instances = Instances(session, self._key)
+            opened.callback(self._instances.close)
             self._taking = threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True)
             self._taking.start()
             self._hearing.begin(session)
@@ -186,6 +189,7 @@ class Consumer:
                     return
                 if item is not _Wake.NEWS:
                     yield from self._take(item)
+            self._instances.look()
             for source in self._presence.due(self._held.room()):
                 self._held.look(source, known=self._progress.number(source) is not None)
             for source in self._held.due():
@@ -232,6 +236,15 @@ class Consumer:
     def refused(self) -> dict[str, int]:
         """The number of results that were not verified, by the gateway as one of which they were published."""
         return dict(self._refusals.counts)
+
+    @property
+    def doubled(self) -> dict[str, tuple[str, ...]]:
+        """The ids of the runs that are on the bus together, of each gateway that is there more than once.
+
+        Such gateways count their results alike, so each number is given once, of one of them. The results say of which
+        by `run_id`.
+        """
+        return self._instances.doubled
 
     @property
     def malformed(self) -> dict[str, int]:

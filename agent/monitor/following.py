@@ -221,6 +221,7 @@ class Following:
             if self._hearing.lost():
                 consumer.close()  # then both sessions are opened anew
                 return
+            self._fleet.set_doubled({source: len(instances) for source, instances in consumer.doubled.items()})
 
     def _take_token(self, token: zenoh.Sample) -> None:
         if (address := parse_key(str(token.key_expr))) is not None:
