@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from agent.delivery.received import Received
 from agent.monitor.engines import LASTING, Engine, Run
 from agent.monitor.summaries import COUNTS, FULL_DAYS, SUMMARISED, merged, packed, split, summarise, unpacked
+from calib.model import PARAMETERS
 
 DAY_NS, HOUR_NS = 86_400_000_000_000, 3_600_000_000_000
 
@@ -80,7 +81,11 @@ class Database:
 
     def _row(self, result: Received) -> _Row:
         a, fields, now_ns = result.address, result.fields, self._now_ns()
-        part = {"drift": fields.get("parameter", ""), "window": "used" if fields.get("used") else "refused"}
+        parameter = fields.get("parameter")
+        part = {
+            "drift": parameter if parameter in PARAMETERS else "",  # others would be without end
+            "window": "used" if fields.get("used") else "refused",
+        }
         t_utc_ns = fields.get("t_utc_ns")
         t_utc_ns = t_utc_ns if isinstance(t_utc_ns, int) else now_ns
         short, detail = split(a.what, fields)
@@ -236,8 +241,9 @@ class Database:
 
     def _day(self, t_utc_ns: int) -> int:
         """The day under which a result is filed; one that comes late is not summarised before its day is full."""
-        today = self._now_ns() // DAY_NS
-        day = min(max(t_utc_ns // DAY_NS, today - self._full_days), today)
+        first = LASTING + 1  # a clock that is not set yet begins in 1970
+        today = max(self._now_ns() // DAY_NS, first)
+        day = min(max(t_utc_ns // DAY_NS, today - self._full_days, first), today)
         if day not in self._days:
             with self._engine.transaction() as run:
                 run("INSERT INTO day VALUES (:day, 0) ON CONFLICT DO NOTHING", day=day)

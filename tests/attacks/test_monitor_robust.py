@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import logging
+import socket
 import sqlite3
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+from agent.monitor import server
 from agent.monitor.following import Following
 from tests.attacks.monitor_pages import bus, pages, shown
 from tests.unit.monitor_site import Served
@@ -172,6 +174,22 @@ def test_a_locked_database_is_told_and_nothing_is_lost(served: Served, gateway: 
     assert [row["sequence"] for row in served.ask(kept).json] == list(range(first, first + 250))
 
 
+def test_a_full_disk_is_told_and_nothing_is_lost(served: Served, gateway: Sender) -> None:
+    gateway.send(record(gateway.next(), "status", "before"))
+    wait_for(lambda: shown(served) == {"before": "VALID"})
+    with served.database._engine.transaction() as run:  # as much as SQLite may write, in place of the disk
+        ((pages,),) = run("PRAGMA page_count")
+        run(f"PRAGMA max_page_count = {pages}")
+    first = gateway.next()
+    gateway.send(*(record(first + k, "calibration", "mems") for k in range(100)))
+    wait_for(lambda: "results are not kept, and wait: database or disk is full" in bus(served)["fault"])
+    with served.database._engine.transaction() as run:
+        run("PRAGMA max_page_count = 1000000")
+    kept = "/api/history?site=site&gateway=good&sensor=mems&what=calibration"
+    wait_for(lambda: len(served.ask(kept).json) == 100)
+    assert bus(served)["fault"] == ""
+
+
 def test_a_database_that_cannot_be_read_is_told_in_one_line(served: Served, tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "monitor" / "monitor.sqlite", isolation_level=None)) as other:
         other.execute("DROP TABLE summary")
@@ -230,6 +248,52 @@ OTHERS = (("Range", "bytes=0-,1-,2-"), ("Range", "bytes=9999999999999999999999-"
           ("If-Modified-Since", "\xff"), ("Expect", "100-continue"), ("Accept-Encoding", "gzip;q=x" * 500),
           ("Upgrade", "websocket"), ("X-Forwarded-For", "\xff, [::"), ("Forwarded", "for=["))  # fmt: skip
 LENGTHS = ("-1", "1e3", "0x10", "9" * 400, "1, 2", "+1", "\u0663")
+
+
+REQUESTS = (b"", b"\r\n\r\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"GET",
+            b"\xff" * 999,
+            b"GET / HTTP/9.9\r\n\r\n", b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n",
+            b"GET http://evil.example.org/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b"CONNECT a:1 HTTP/1.1\r\n\r\n",
+            b"GET / HTTP/1.0\r\n\r\n", b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"a: b\r\n" * 9000 + b"\r\n",
+            b"POST /api/login HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\nContent-Length: 1\r\n"
+            b"Content-Length: 2\r\n\r\n{}", b"GET /\x00 HTTP/1.1\r\n\r\n", b"GET / HTTP/1.1\r\nHost\x00: a\r\n\r\n",
+            b"POST /api/login HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\nTransfer-Encoding: chunked\r\n"
+            b"\r\nfffffffffffffffffffff\r\n")  # fmt: skip
+
+
+def test_what_is_no_request_is_refused_and_does_not_fill_the_log(
+    served: Served, caplog: pytest.LogCaptureFixture
+) -> None:
+    logging.disable(logging.NOTSET)
+    host, port = served.address.split(":")
+    for request in REQUESTS * 3:
+        with closing(socket.create_connection((host, int(port)), 5)) as connection, suppress(ConnectionError):
+            connection.sendall(request)
+            connection.shutdown(socket.SHUT_WR)
+            answer = connection.recv(100)
+            assert not answer or answer.split()[1] in (b"400", b"404", b"405"), request
+    assert len(caplog.records) <= 3, [one.getMessage() for one in caplog.records]
+    assert served.ask("/api/fleet").status == 200
+
+
+def test_readers_who_leave_free_their_places(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "LISTENERS_MAX", 3)
+    host, port = served.address.split(":")
+    asked = f"GET /api/changes HTTP/1.1\r\nHost: {served.address}\r\n\r\n".encode()
+
+    def status() -> bytes:
+        with closing(socket.create_connection((host, int(port)), 5)) as connection:
+            connection.sendall(asked)
+            return connection.recv(100).split()[1]
+
+    with ExitStack() as opened:
+        for _ in range(3):
+            reader = opened.enter_context(closing(socket.create_connection((host, int(port)), 5)))
+            reader.sendall(asked)
+            assert reader.recv(100).split()[1] == b"200"
+        assert status() == b"503"
+    for _ in range(10):
+        wait_for(lambda: status() == b"200")
 
 
 def test_headers_are_refused_and_not_a_fault(served: Served, caplog: pytest.LogCaptureFixture) -> None:
