@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -44,7 +45,7 @@ class Fleet:
     """
 
     def __init__(self) -> None:
-        self.version = 0
+        self.version = time.time_ns() // 1_000_000  # after those before a restart, which pages that are open know
         self.left_out = 0
         self._newest: dict[Place, dict[str, dict[str, Any]]] = {}
         self._alive: set[tuple[str, str]] = set()
@@ -179,6 +180,8 @@ class Fleet:
         state = self._state_of(place[:2])
         made = self._made.get(place)
         if made is None or made[0] != state:
+            if made is not None:
+                self._changed[place] = self.version
             row = _row(place, self._newest[place], state) | {"changed": self._changed[place]}
             made = self._made[place] = state, row
         return made[1]

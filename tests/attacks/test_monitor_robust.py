@@ -6,7 +6,7 @@ import csv
 import logging
 import socket
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from tests.unit.zenoh_site import Site, record, wait_for
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 from agent.monitor import server
+from agent.monitor.fleet import Fleet
 from agent.monitor.following import Following
 from tests.attacks.monitor_pages import bus, pages, shown
 from tests.unit.monitor_site import Served
@@ -250,8 +251,32 @@ OTHERS = (("Range", "bytes=0-,1-,2-"), ("Range", "bytes=9999999999999999999999-"
 LENGTHS = ("-1", "1e3", "0x10", "9" * 400, "1, 2", "+1", "\u0663")
 
 
-REQUESTS = (b"", b"\r\n\r\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b"GET",
-            b"\xff" * 999,
+def test_whatever_changes_in_a_row_changes_its_stamp_also_over_a_restart() -> None:
+    """By its stamp a page leaves rows alone that have not changed."""
+    before = stamps_rise(Fleet(), 0)
+    wait_for(lambda: Fleet().version > before)  # a restart takes longer than a millisecond for each change before it
+    stamps_rise(Fleet(), before)
+
+
+def stamps_rise(fleet: Fleet, before: int) -> int:
+    steps: list[Callable[[], None]] = [
+        lambda: fleet.take("site", "gw", "mems", "status", {"status": "VALID", "reason": "", "t_utc_ns": 1}),
+        lambda: fleet.set_alive("site", "gw", True),
+        lambda: fleet.set_told("site", "gw", b'{"state": "degraded", "reasons": ["x"], "t_utc_ns": 1}'),
+        lambda: fleet.take("site", "gw", "mems", "status", {"status": "HELD", "reason": "", "t_utc_ns": 2}),
+        lambda: fleet.set_alive("site", "gw", False),
+    ]
+    for step in steps:
+        step()
+        (first,) = fleet.rows()
+        (again,) = fleet.rows()
+        assert before < first["changed"] == again["changed"]
+        before = first["changed"]
+    return before
+
+
+REQUESTS = (b"", b"\r\n\r\n", b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+            b"GET", b"\xff" * 999,
             b"GET / HTTP/9.9\r\n\r\n", b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: localhost\r\n\r\n",
             b"GET http://evil.example.org/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b"CONNECT a:1 HTTP/1.1\r\n\r\n",
             b"GET / HTTP/1.0\r\n\r\n", b"GET / HTTP/1.1\r\nHost: localhost\r\n" + b"a: b\r\n" * 9000 + b"\r\n",
