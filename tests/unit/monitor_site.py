@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import http.client
 import json
+import resource
 import signal
 import socket
 import ssl
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, ExitStack, closing
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -151,3 +152,14 @@ class Monitor:
         said = self._process.communicate(timeout=10)[1].decode()
         assert (self._process.returncode, "Traceback" in said, "FATAL" in said) == (0, False, False), said
         return said
+
+
+@contextmanager
+def many(address: str, count: int) -> Iterator[list[socket.socket]]:
+    """So many connections to a server, which send nothing."""
+    host, port = address.split(":")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    with ExitStack() as opened:
+        yield [opened.enter_context(socket.create_connection((host, int(port)), 10)) for _ in range(count)]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +18,13 @@ from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from tests.unit.zenoh_site import KEY, Site, record, wait_for
 
-TOGETHER_S = 0.5  # in place of 30 s
+pytest.importorskip("starlette", reason="the extra monitor is not installed")
+pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+from agent.monitor.notices import Watch
+from agent.monitor.settings import Notices
+from tests.unit.monitor_site import Served
+
+TOGETHER_S = 0.2  # in place of 30 s
 
 
 @pytest.fixture(autouse=True)
@@ -43,47 +48,60 @@ class Gateway:
         return self.publisher.state().fault
 
     def close(self) -> None:
+        """May be called twice."""
         self.publisher.close()
         self.store.close()
 
 
-@pytest.fixture
-def consumer(site: Site) -> Iterator[Consumer]:
-    """One whose results are taken by a thread."""
-    with Consumer([site.endpoint]) as consumer:
-        threading.Thread(target=lambda: list(consumer), daemon=True).start()
-        yield consumer
-
-
-def test_a_copied_card_is_told_to_the_second_gateway_and_to_consumers_and_then_no_more(
-    site: Site, consumer: Consumer, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_a_copied_card_is_told_to_the_second_gateway_to_consumers_and_on_the_page(
+    site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with closing(Store(tmp_path / "card")) as store:
         store.commit([record(store.last_sequence() + 1)])
     shutil.copytree(tmp_path / "card", tmp_path / "copy")
-    with closing(Gateway(site, tmp_path / "card")) as first:
-        with closing(Gateway(site, tmp_path / "copy")) as second:
-            wait_for(lambda: second.fault.startswith("2 gateways are on the bus as site/gw (runs "))
-            wait_for(lambda: [len(found) for found in consumer.doubled.values()] == [2])
-        wait_for(lambda: consumer.doubled == {})
-        with closing(Gateway(site, tmp_path / "copy")) as second:
-            wait_for(lambda: second.fault != "")
-            first.close()
-            wait_for(lambda: second.fault == "")
-    told = [one.getMessage() for one in caplog.records if "gateways are on the bus" in one.getMessage()]
-    assert len(told) == 4  # each time once by the gateway and once by the consumer
+    with ExitStack() as opened:
+        served = opened.enter_context(Served(site, tmp_path / "monitor"))
+        watch = Watch(served.fleet, Notices(), [])
+        consumer = opened.enter_context(Consumer([site.endpoint]))
+        threading.Thread(target=lambda: list(consumer), daemon=True).start()
+        first = opened.enter_context(closing(Gateway(site, tmp_path / "card")))
+
+        def told() -> list[tuple[int, str]]:
+            return [(row["instances"], row["why"]) for row in served.ask("/api/fleet").json["gateways"]]
+
+        def notices() -> list[str]:
+            return [notice.text for notice in watch.update(time.monotonic(), datetime.now(UTC))]
+
+        wait_for(lambda: told() == [(1, "")])
+        version = served.fleet.version
+        second = opened.enter_context(closing(Gateway(site, tmp_path / "copy")))
+        wait_for(lambda: second.fault.startswith("2 gateways are on the bus as site/gw (runs "))
+        wait_for(lambda: [len(found) for found in consumer.doubled.values()] == [2])
+        words = "2 gateways are on the bus under this name: stop one of them, or give it another name"
+        wait_for(lambda: told() == [(2, words)])
+        assert (notices(), notices()) == (["more than one gateway is on the bus under this name"], [])
+        first.close()
+        wait_for(lambda: (second.fault, consumer.doubled, told()) == ("", {}, [(1, "")]))
+        assert served.fleet.version >= version + 2  # pages that are open learn both
+    logged = [one.getMessage() for one in caplog.records if "gateways are on the bus" in one.getMessage()]
+    assert 3 <= len(logged) <= 4  # by the consumer, the monitor, and each gateway that looks
 
 
-def test_a_restart_and_a_replaced_gateway_are_no_second_one(site: Site, consumer: Consumer, tmp_path: Path) -> None:
+def test_a_restart_and_a_restored_card_are_no_second_gateway(site: Site, tmp_path: Path) -> None:
     with closing(Gateway(site, tmp_path / "card")):
         pass
     shutil.copytree(tmp_path / "card", tmp_path / "copy")
-    for card in ("card", "copy", "card"):
-        with closing(Gateway(site, tmp_path / card)) as gateway:
-            end_s = time.monotonic() + 2 * TOGETHER_S
-            while time.monotonic() < end_s:
-                assert (gateway.fault, consumer.doubled) == ("", {})
-                time.sleep(0.02)  # looks until the time is over in which a second one would be told
+    with site.client() as session:
+        watched = Instances(session, f"{KEY}/**")
+        for card in ("card", "copy"):
+            with closing(Gateway(site, tmp_path / card)) as gateway:
+                wait_for(lambda: len(watched._since_s.get("site/gw", {})) == 1)
+                end_s = time.monotonic() + 2 * TOGETHER_S
+                while time.monotonic() < end_s:
+                    watched.look()
+                    assert (gateway.fault, watched.doubled) == ("", {})
+                    time.sleep(0.02)  # looks until the time is over in which a second one would be told
+        watched.close()
 
 
 def test_the_token_of_a_killed_run_is_no_second_gateway_while_the_router_keeps_it(site: Site) -> None:
@@ -117,32 +135,3 @@ def test_invented_instances_are_bounded(site: Site, monkeypatch: pytest.MonkeyPa
         assert len(watched._since_s) == 3
         assert len(held) == 101
         watched.close()
-
-
-def test_the_page_and_the_notices_tell_it(site: Site, tmp_path: Path) -> None:
-    pytest.importorskip("starlette", reason="the extra monitor is not installed")
-    pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
-    from agent.monitor.notices import Watch
-    from agent.monitor.settings import Notices
-    from tests.unit.monitor_site import Served
-
-    with ExitStack() as opened:
-        served = opened.enter_context(Served(site, tmp_path / "monitor"))
-        watch = Watch(served.fleet, Notices(), [])
-        opened.enter_context(closing(Gateway(site, tmp_path / "card")))
-
-        def told() -> list[tuple[int, str]]:
-            return [(row["instances"], row["why"]) for row in served.ask("/api/fleet").json["gateways"]]
-
-        def notices() -> list[str]:
-            return [notice.text for notice in watch.update(time.monotonic(), datetime.now(UTC))]
-
-        wait_for(lambda: told() == [(1, "")])
-        version = served.fleet.version
-        with closing(Gateway(site, tmp_path / "copy")):
-            words = "2 gateways are on the bus under this name: stop one of them, or give it another name"
-            wait_for(lambda: told() == [(2, words)])
-            assert notices() == ["more than one gateway is on the bus under this name"]
-            assert notices() == []
-        wait_for(lambda: told() == [(1, "")])
-        assert served.fleet.version >= version + 2  # pages that are open learn both
