@@ -61,6 +61,7 @@ class Service:
         self._weighing = Weighing(config)
         self._stop_request = threading.Event()
         self._sequence = 0
+        self._run_id = uuid.uuid4().hex
         self.refused: list[str] = []  # why the run ended by itself: transfers that the adapters of all channels refuse
         self.begun = False  # whether the devices are read; before that, a stop is as harmless as a power cut
 
@@ -161,6 +162,7 @@ class Service:
             self._store,
             tls=zenoh.tls.files if zenoh.tls else None,
             serve=self._reception.serve if self._reception else None,
+            instance=self._run_id,
         )
         publisher.start()
         return publisher
@@ -188,7 +190,6 @@ class Service:
     def _begin(self) -> None:
         self._engine_sha256 = keep_engine(self._data_dir)
         self._origin_ns = time.monotonic_ns()
-        self._run_id = uuid.uuid4().hex
         self._pipeline = Pipeline.begin(
             self._config, self._run_id, self._origin_ns, self._store.last_sequence(), self._kept()
         )

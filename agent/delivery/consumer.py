@@ -21,12 +21,13 @@ from agent.config.tls import TlsFiles
 from agent.delivery.asking import Asking
 from agent.delivery.hearing import Hearing
 from agent.delivery.holding import Held
-from agent.delivery.keys import PREFIX
+from agent.delivery.instances import Instances
+from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.memory import Memory
 from agent.delivery.presence import Presence
 from agent.delivery.progress import Progress
 from agent.delivery.questions import Answer, Dialogue, Questions, Replies, answer_of, steps
-from agent.delivery.received import Received, receive
+from agent.delivery.received import Received, number_of, receive
 from agent.delivery.session import session_config
 from agent.delivery.verifying import Refusals, UnverifiedError, Verifier
 
@@ -92,7 +93,7 @@ class Consumer:
         trust_first: bool = False,
     ) -> None:
         self._verifier = Verifier(WatchedKeys(keys), trust_first=trust_first) if keys is not None else None
-        self._refusals = Refusals()
+        self._refusals, self._malformed = Refusals(), Refusals()
         self._memory = Memory(memory)
         self._progress = Progress(self._memory.numbers | dict(last_sequence or {}))
         self._inbox: queue.Queue[zenoh.Sample | Replies | _Wake] = queue.Queue()
@@ -127,6 +128,8 @@ class Consumer:
             opened.callback(subscriber.undeclare)
             self._presence = Presence(session, self._key, lambda: self._inbox.put(_Wake.NEWS))
             opened.callback(self._presence.close)
+            self._instances = Instances(session, self._key)
+            opened.callback(self._instances.close)
             self._taking = threading.Thread(target=self._take_samples, args=(subscriber,), name="consumer", daemon=True)
             self._taking.start()
             self._hearing.begin(session)
@@ -186,6 +189,7 @@ class Consumer:
                     return
                 if item is not _Wake.NEWS:
                     yield from self._take(item)
+            self._instances.look()
             for source in self._presence.due(self._held.room()):
                 self._held.look(source, known=self._progress.number(source) is not None)
             for source in self._held.due():
@@ -234,6 +238,20 @@ class Consumer:
         return dict(self._refusals.counts)
 
     @property
+    def doubled(self) -> dict[str, tuple[str, ...]]:
+        """The ids of the runs that are on the bus together, of each gateway that is there more than once.
+
+        Such gateways count their results alike, so each number is given once, of one of them. The results say of which
+        by `run_id`.
+        """
+        return self._instances.doubled
+
+    @property
+    def malformed(self) -> dict[str, int]:
+        """The number of messages at the key of a result that are none, by the gateway in whose name they came."""
+        return dict(self._malformed.counts)
+
+    @property
     def dropped(self) -> dict[str, int]:
         """The number of results that had to wait for earlier ones and found no place, by gateway; "": of too many."""
         return dict(self._held.dropped)
@@ -271,17 +289,21 @@ class Consumer:
                 yield from self._follow(result)
 
     def _received(self, sample: zenoh.Sample) -> tuple[Received | None, int]:
-        """(the result, or None where it is none or is refused; its number, also where it is refused, otherwise 0)."""
+        """(the result, or None where it is none or is refused; the number that it claims, otherwise 0)."""
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
         parts = str(sample.key_expr), sample.payload.to_bytes(), attachment
         try:
             result = receive(*parts, self._verifier)
         except UnverifiedError as error:
-            claimed = receive(*parts)
             source = "/".join(parts[0].split("/")[2:4])
             self._refusals.count(source, str(error))
-            return None, claimed.sequence if claimed else 0
-        if result is not None and result.altered:
+            return None, number_of(parts[1])
+        if result is None:
+            if (address := parse_key(parts[0])) is None or not address.is_result:
+                return None, 0
+            self._malformed.count(address.source, "it has not the fields and numbers of its kind")
+            return None, number_of(parts[1])
+        if result.altered:
             what = "%s: the JSON of result %d says something else than its signed bytes: %s"
             _log.warning(what, result.address.source, result.sequence, ", ".join(result.altered))
-        return result, result.sequence if result else 0
+        return result, result.sequence

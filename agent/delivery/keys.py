@@ -39,6 +39,11 @@ class Address:
         """`<site>/<gateway>`; each gateway counts its own sequence."""
         return f"{self.site}/{self.gateway}"
 
+    @property
+    def is_result(self) -> bool:
+        """Whether results are published here. The gateway's own messages and the corrected stream are none."""
+        return bool(self.sensor) and self.what != "acceleration"
+
 
 def parse_key(key: str) -> Address | None:
     """Split the key of a result into its parts; None where it is not such a key."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import logging
 import threading
+import uuid
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -19,6 +20,7 @@ from agent.config.tls import TlsFiles, expiry_warning
 from agent.delivery.answers import answer_queries, attachment_of
 from agent.delivery.hearing import Hearing
 from agent.delivery.history import History, Record, StoreError
+from agent.delivery.instances import watch_own_name
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import session_config
 from agent.delivery.store import Store
@@ -67,7 +69,8 @@ class Publisher:
     when a router appears. With the `mode` "client" it opens faster, but only while a router is there.
     `poll_s`: time in s after which a router that came back is noticed.
     `tls`: certificates, for endpoints tls/... `serve(session, open_things)` is called with each
-    new session.
+    new session. `instance`: the id of this run, by which two gateways with one name are found
+    (agent.delivery.instances); one is drawn if it is "".
     Raises ValueError for an invalid name, EndpointError for an invalid endpoint. The methods raise nothing.
     """
 
@@ -82,6 +85,7 @@ class Publisher:
         mode: Literal["peer", "client"] = "peer",
         poll_s: float = POLL_S,
         serve: Callable[[zenoh.Session, ExitStack], None] | None = None,
+        instance: str = "",
     ) -> None:
         self._key = gateway_key(site, gateway)
         self._endpoints = tuple(connect)
@@ -89,6 +93,7 @@ class Publisher:
         self._tls = tls
         self._poll_s = poll_s
         self._serve_more = serve
+        self._instance = instance or uuid.uuid4().hex
         self._store = store
         self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
         self._blocks: deque[tuple[str, bytes]] = deque(maxlen=BLOCKS_MAX)
@@ -103,6 +108,9 @@ class Publisher:
         self._told_put: dict[str, bytes] = {}
         self._hearing = Hearing()
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
+        self._other = ""  # what is said where another gateway has this name
+        looking = session_config("client", connect=connect, tls=tls), self._key, self._stop, self._tell_other
+        self._name_watch = threading.Thread(target=watch_own_name, args=looking, name="own name", daemon=True)
 
     def start(self) -> None:
         """Start publishing in a thread of its own."""
@@ -139,8 +147,9 @@ class Publisher:
     def state(self) -> PublicationState:
         """The present state, for the terminal and the gateway's status."""
         unheard = UNHEARD if self._hearing.doubtful else ""
+        fault = "; ".join(filter(None, (self._fault or unheard, self._other)))
         return PublicationState(
-            self._key, self._endpoints, self._connected, self._store.published(), self._fault or unheard,
+            self._key, self._endpoints, self._connected, self._store.published(), fault,
             self._hearing.reopened,
         )  # fmt: skip
 
@@ -164,6 +173,8 @@ class Publisher:
                 self._fail(str(error))
                 self._stop.wait(REOPEN_S)
             self._connected = False
+        if self._name_watch.ident is not None:
+            self._name_watch.join(CLOSE_S)
 
     def _serve(self) -> None:
         with ExitStack() as open_things:
@@ -183,8 +194,8 @@ class Publisher:
             open_things.callback(queryable.undeclare)
             if self._serve_more is not None:
                 self._serve_more(session, open_things)
-            token = session.liveliness().declare_token(f"{self._key}/alive")
-            open_things.callback(token.undeclare)
+            for key in (f"{self._key}/alive", f"{self._key}/alive/{self._instance}"):
+                open_things.callback(session.liveliness().declare_token(key).undeclare)
             # Before the session closes, otherwise Zenoh leaks the memory of the publishers.
             open_things.callback(self._undeclare_publishers)
             self._hearing.begin(session)
@@ -204,10 +215,15 @@ class Publisher:
                 self._wake.wait(0 if stopping else self._poll_s)
                 self._wake.clear()
 
+    def _tell_other(self, words: str) -> None:
+        self._other = words
+
     def _find_router(self, session: zenoh.Session) -> bool:
         connected = bool(session.info.routers_zid())
         if connected and not self._connected:
             self._stop.wait(SETTLE_S)
+            if self._name_watch.ident is None:
+                self._name_watch.start()
         self._connected = connected
         return connected
 

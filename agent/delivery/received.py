@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -15,6 +15,7 @@ from agent.delivery.verifying import Verifier, differing, signer_of
 
 LARGEST_RESULT = 256 << 10  # bytes; the largest result, a calibration, has 5 kB
 LARGEST_NUMBER = 2**63 - 1
+DEEPEST = 16  # levels of a result; a calibration has five
 _DIGITS_MAX = 19
 _EPOCH = re.compile(r"(?:[0-9a-f]{16})?")
 
@@ -44,12 +45,24 @@ class Received:
     altered: tuple[str, ...] = ()  # fields of which the JSON said something else than the signed bytes
 
 
+class _Numbered(msgspec.Struct):
+    sequence: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NUMBER)]
+
+
+def number_of(payload: bytes) -> int:
+    """The number that a payload claims, whatever else it says; 0 where it has none."""
+    try:
+        return msgspec.json.decode(payload, type=_Numbered).sequence if len(payload) <= LARGEST_RESULT else 0
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        return 0
+
+
 def receive(key: str, payload: bytes, attachment: bytes | None, verifier: Verifier | None = None) -> Received | None:
     """Decode a sample; returns None where it is not a result of a gateway, for any bytes.
 
     A result of a known kind must have all its fields, of the right types and shapes. Of a kind that this version does
-    not know, only the fields `sequence` and `sensor` are checked. With a `verifier` only a result that its gateway
-    signed is returned, and a result that is not verified raises UnverifiedError.
+    not know, only the fields `sequence` and `sensor` are checked. Integers have 64 bits in both. With a `verifier` only
+    a result that its gateway signed is returned, and a result that is not verified raises UnverifiedError.
     """
     address = parse_key(key)
     before, _, signed = (attachment or b"").partition(b"\n")
@@ -60,8 +73,8 @@ def receive(key: str, payload: bytes, attachment: bytes | None, verifier: Verifi
     previous = int(before) if before else None
     if verifier is None:
         return _plain(key, address, payload, previous, signed)
-    if not address.sensor or address.what == "acceleration":
-        return None  # not a result, so it is not signed
+    if not address.is_result:
+        return None  # so it is not signed
     return _verified(key, address, payload, previous, signed, verifier)
 
 
@@ -87,6 +100,8 @@ def _plain(key: str, address: Address, payload: bytes, previous: int | None, sig
         result = result_of(address.what, fields)
     except (msgspec.DecodeError, ValueError, RecursionError):  # not UTF-8; or too many nested brackets
         return None
+    if not _is_bounded(fields, DEEPEST):
+        return None
     calibration = result.calibration if isinstance(result, Estimate) else result
     if isinstance(calibration, CalibrationUpdate) and not _has_its_shapes(calibration):
         return None
@@ -97,6 +112,16 @@ def _plain(key: str, address: Address, payload: bytes, previous: int | None, sig
     if not isinstance(epoch, str) or not _EPOCH.fullmatch(epoch):
         return None
     return Received(key, address, sequence, fields, previous, epoch=epoch, signed=signed)
+
+
+def _is_bounded(value: Any, levels: int) -> bool:
+    """Whether integers have 64 bits, and lists and objects are nested at most so many `levels` deep."""
+    if isinstance(value, int):
+        return -LARGEST_NUMBER <= value <= LARGEST_NUMBER
+    if isinstance(value, (dict, list)):
+        within = value.values() if isinstance(value, dict) else value
+        return levels > 0 and all(_is_bounded(each, levels - 1) for each in within)
+    return True
 
 
 def _has_its_shapes(calibration: CalibrationUpdate) -> bool:

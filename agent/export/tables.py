@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.export.samples import Content, ExportError, Samples, new_file
-from agent.terminal.text import one_line
+from agent.terminal.text import no_formula, one_line
 from calib.model import Array
 
 QUANTITIES = {"m/s2": "a", "m/s": "v", "m": "d"}  # name of the column of a uniaxial device, by its unit
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # with which a cell begins that a spreadsheet would calculate
 
 
 def names_of(content: Content) -> list[str]:
@@ -29,7 +28,7 @@ def write_csv(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
     Samples that are corrected by S and Q smoothed over the past have a last column, `calibration`, and lines with # at
     the head that say by what.
     """
-    rows, head = 0, [f"# {name}: {text}\n" for name, text in _about(content).items()]
+    rows, head = 0, [no_formula(f"# {name}: {text}") + "\n" for name, text in _about(content).items()]
     names = ["time_s", *names_of(content), *(["calibration"] if content.smoothed else [])]
     with new_file(path) as file:
         file.writelines(map(str.encode, [*head, ",".join(map(cell, names)) + "\n"]))
@@ -54,7 +53,7 @@ def _about(content: Content) -> dict[str, str]:
 
 def cell(text: str) -> str:
     """A text as a cell of CSV that no spreadsheet takes for a formula."""
-    text = f"'{text}" if text.startswith(FORMULA) else text
+    text = no_formula(text)
     return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
 
 

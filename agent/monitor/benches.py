@@ -15,6 +15,9 @@ from agent.delivery.keys import CHUNK
 # A stranger may invent gateways for ever. The one that was heard longest ago gives way, and a session that goes on
 # says the same again every two seconds.
 BENCHES_MAX = 100
+# s after the last guide from which an older one is taken: the clock of the gateway was put back, or one guide came from
+# the future. A session that goes on is heard more often.
+BACK_S = 10.0
 
 Gateway = tuple[str, str]  # site, gateway
 
@@ -34,15 +37,16 @@ class Benches:
         self._mutex = threading.Lock()
 
     def take(self, site: str, gateway: str, guide: Guide) -> None:
-        """Take a guide, unless it is older than the one before or of a name that no gateway can have."""
+        """Take a guide, unless it is older than one just heard, or of a name that no gateway can have."""
         if not (CHUNK.fullmatch(site) and CHUNK.fullmatch(gateway)):
             return
         with self._mutex:
             before = self._newest.get((site, gateway))
-            if before is not None and guide.t_utc_ns < before.guide.t_utc_ns:
+            now_s = time.monotonic()
+            if before is not None and guide.t_utc_ns < before.guide.t_utc_ns and now_s - before.at_s < BACK_S:
                 return  # one that was recorded and sent again
             self._newest.pop((site, gateway), None)
-            self._newest[site, gateway] = _Heard(guide, time.monotonic())
+            self._newest[site, gateway] = _Heard(guide, now_s)
             if len(self._newest) > BENCHES_MAX:
                 del self._newest[next(iter(self._newest))]
             self.version += before is None or before.guide != guide

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import zlib
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 from agent.delivery.received import Received
 from agent.monitor.engines import LASTING, Engine, Run
 from agent.monitor.summaries import COUNTS, FULL_DAYS, SUMMARISED, merged, packed, split, summarise, unpacked
+from calib.model import PARAMETERS
 
 DAY_NS, HOUR_NS = 86_400_000_000_000, 3_600_000_000_000
 
@@ -52,12 +54,14 @@ class _Row(NamedTuple):
 class Database:
     """Results by sensor, in the order of their arrival. May be used by several threads.
 
+    `damaged`: the numbers of rows that were to be read and are not as they were written; they are left out.
     `now_ns`: the present, UTC; a result that says to be of a later day is filed under today. Raises sqlite3.Error or
     DatabaseError where the engine cannot be used.
     """
 
     def __init__(self, engine: Engine, *, full_days: int = FULL_DAYS, now_ns: Callable[[], int] = time.time_ns) -> None:
         self._engine, self._full_days, self._now_ns = engine, full_days, now_ns
+        self.damaged: set[int] = set()
         self._mutex = threading.Lock()
         self._sensors: dict[tuple[str, str, str], int] = {}
         self._days: set[int] = set()
@@ -77,10 +81,14 @@ class Database:
 
     def _row(self, result: Received) -> _Row:
         a, fields, now_ns = result.address, result.fields, self._now_ns()
-        part = {"drift": fields.get("parameter", ""), "window": "used" if fields.get("used") else "refused"}
+        parameter = fields.get("parameter")
+        part = {
+            "drift": parameter if parameter in PARAMETERS else "",  # others would be without end
+            "window": "used" if fields.get("used") else "refused",
+        }
         t_utc_ns = fields.get("t_utc_ns")
         t_utc_ns = t_utc_ns if isinstance(t_utc_ns, int) else now_ns
-        short, detail = split(fields) if a.what in SUMMARISED else (fields, None)
+        short, detail = split(a.what, fields)
         return _Row(
             gateway=(a.site, a.gateway, result.epoch), sequence=result.sequence,
             day=self._day(t_utc_ns) if a.what in SUMMARISED else LASTING, hour=min(t_utc_ns, now_ns) // HOUR_NS,
@@ -139,10 +147,12 @@ class Database:
         """
         with self._engine.transaction() as run:
             rows = run(
-                "SELECT s.site, s.gateway, s.sensor, r.what, r.payload FROM newest n JOIN sensor s ON s.id = n.sensor"
+                "SELECT s.site, s.gateway, s.sensor, r.what, r.number, r.payload FROM newest n"
+                " JOIN sensor s ON s.id = n.sensor"
                 " JOIN result r ON r.sensor = n.sensor AND r.what = n.what AND r.number = n.number ORDER BY r.number"
             )
-        return [(*row[:4], unpacked(row[4])) for row in rows]
+        read = [(row, self._read(row[3], *row[4:])) for row in rows]
+        return [(*row[:4], fields) for row, fields in read if fields is not None]
 
     def history(self, site: str, gateway: str, sensor: str, what: str, limit: int) -> list[dict[str, Any]]:
         """The newest `limit` results of one kind of a sensor, oldest first; of the older ones the last of each hour."""
@@ -154,10 +164,11 @@ class Database:
             )[::-1]  # fmt: skip
             held = _detail_before(run, what, *rows[0][2:]) if rows and rows[0][1] is None else None
         found, day = [], rows[0][2] if rows else LASTING
-        for payload, detail, at, *_ in rows:
+        for payload, detail, at, number, _ in rows:
             held = detail if detail is not None or at != day or at == LASTING else held
             day = at
-            found.append(merged(unpacked(payload), held))
+            if (fields := self._read(what, number, payload, held)) is not None:
+                found.append(fields)
         return found
 
     def spread(self, site: str, gateway: str, sensor: str, what: str, most: int) -> list[dict[str, Any]]:
@@ -167,12 +178,22 @@ class Database:
         """
         with self._engine.transaction() as run:
             rows = run(
-                "SELECT r.payload FROM result r WHERE r.number IN (SELECT max(number) FROM (SELECT number, ntile(:most)"
+                "SELECT r.number, r.payload FROM result r WHERE r.number IN"
+                " (SELECT max(number) FROM (SELECT number, ntile(:most)"
                 f" OVER (ORDER BY number) AS tile FROM result WHERE sensor = {_OF} AND what = :what) t GROUP BY tile)"
                 f" AND r.sensor = {_OF} AND r.what = :what ORDER BY r.number",
                 most=most, site=site, gateway=gateway, name=sensor, what=what,
             )  # fmt: skip
-        return [unpacked(payload) for (payload,) in rows]
+        read = (self._read(what, *row) for row in rows)
+        return [fields for fields in read if fields is not None]
+
+    def _read(self, what: str, number: int, payload: bytes, detail: bytes | None = None) -> dict[str, Any] | None:
+        """The fields of a row, with its detail; None where the row is damaged."""
+        try:
+            return merged(what, unpacked(payload), detail)
+        except (zlib.error, ValueError, KeyError, TypeError):  # ValueError: no JSON, or shared errors of another length
+            self.damaged.add(number)
+            return None
 
     def summaries(self, site: str, gateway: str, sensor: str, limit: int) -> list[dict[str, Any]]:
         """The newest `limit` hours that are summarised, oldest first: `t_utc_ns` of its end, last status, counts."""
@@ -220,8 +241,9 @@ class Database:
 
     def _day(self, t_utc_ns: int) -> int:
         """The day under which a result is filed; one that comes late is not summarised before its day is full."""
-        today = self._now_ns() // DAY_NS
-        day = min(max(t_utc_ns // DAY_NS, today - self._full_days), today)
+        first = LASTING + 1  # a clock that is not set yet begins in 1970
+        today = max(self._now_ns() // DAY_NS, first)
+        day = min(max(t_utc_ns // DAY_NS, today - self._full_days, first), today)
         if day not in self._days:
             with self._engine.transaction() as run:
                 run("INSERT INTO day VALUES (:day, 0) ON CONFLICT DO NOTHING", day=day)

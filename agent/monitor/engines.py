@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 Rows = list[tuple[Any, ...]]
 LASTING = 0  # in place of a day: rows that are never dropped
+BUSY_S = 1.0  # s to wait for another program that has locked the file; the questions of the page wait meanwhile
 _LOCK = 7_160_001  # key of the lock under which PostgreSQL makes tables and partitions, and adds results
 
 
@@ -64,7 +65,7 @@ class Sqlite:
     NUMBER, BYTES, PARTITIONED = "INTEGER PRIMARY KEY", "BLOB", ""
 
     def __init__(self, path: Path) -> None:
-        self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+        self._connection = sqlite3.connect(path, BUSY_S, check_same_thread=False, isolation_level=None)
         self._mutex = threading.Lock()
         self._connection.execute("PRAGMA journal_mode = WAL")
         # A power cut may undo the last results; `last_sequence` then asks the gateways for them again.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import Counter, deque
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
@@ -32,7 +33,7 @@ class GatewayTold(msgspec.Struct, frozen=True):
 
     state: str
     reasons: list[str]
-    t_utc_ns: int
+    t_utc_ns: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     version: str = ""
 
 
@@ -44,11 +45,12 @@ class Fleet:
     """
 
     def __init__(self) -> None:
-        self.version = 0
+        self.version = time.time_ns() // 1_000_000  # after those before a restart, which pages that are open know
         self.left_out = 0
         self._newest: dict[Place, dict[str, dict[str, Any]]] = {}
         self._alive: set[tuple[str, str]] = set()
         self._told: dict[tuple[str, str], GatewayTold] = {}
+        self._doubled: dict[tuple[str, str], int] = {}
         self._gateways: set[tuple[str, str]] = set()
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
         self._made: dict[Place, tuple[str, dict[str, Any]]] = {}  # the row of each sensor, for a state of its gateway
@@ -131,6 +133,13 @@ class Fleet:
                 self._alive.discard((site, gateway))
             self.version += 1
 
+    def set_doubled(self, doubled: Mapping[str, int]) -> None:
+        """The gateways (`<site>/<gateway>`) of which more than one is on the bus, with their numbers."""
+        found = {_place(source): count for source, count in doubled.items()}
+        with self._mutex:
+            self.version += found != self._doubled
+            self._doubled = found
+
     def set_told(self, site: str, gateway: str, status: bytes) -> None:
         """What a gateway says of itself, as JSON; what is no such status is ignored."""
         if len(status) > LARGEST_TOLD:
@@ -162,7 +171,7 @@ class Fleet:
             counts = Counter(place[:2] for place in self._newest)
             rows = [
                 _gateway_row(place, counts[place], place in self._alive, self._told.get(place),
-                             refused.get("/".join(place), 0))
+                             refused.get("/".join(place), 0), self._doubled.get(place, 1))
                 for place in self._gateways | {_place(source) for source in refused}
             ]  # fmt: skip
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
@@ -171,6 +180,8 @@ class Fleet:
         state = self._state_of(place[:2])
         made = self._made.get(place)
         if made is None or made[0] != state:
+            if made is not None:
+                self._changed[place] = self.version
             row = _row(place, self._newest[place], state) | {"changed": self._changed[place]}
             made = self._made[place] = state, row
         return made[1]
@@ -225,9 +236,11 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str) ->
 
 
 def _gateway_row(
-    place: tuple[str, str], sensors: int, alive: bool, told: GatewayTold | None, refused: int
+    place: tuple[str, str], sensors: int, alive: bool, told: GatewayTold | None, refused: int, instances: int
 ) -> dict[str, Any]:
     why = [] if alive else ["the gateway is not on the bus"]
+    if instances > 1:
+        why.append(f"{instances} gateways are on the bus under this name: stop one of them, or give it another name")
     if told is not None and told.state != "running":
         why.append(clipped(f"{told.state}: {'; '.join(told.reasons[:10])}"))
     if refused:
@@ -241,6 +254,7 @@ def _gateway_row(
         "version": clipped(told.version) if told else "",
         "told_utc_ns": told.t_utc_ns if told else None,
         "refused": refused,
+        "instances": instances,
         "why": "; ".join(why),
     }
 

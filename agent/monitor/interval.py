@@ -32,6 +32,7 @@ PEERS_MIN = 3
 UNLIKE = 2.0  # a drift of so many of its standard uncertainties, that of the peers included, contradicts the peers
 # The interval is at most this many times the time that was observed: beyond, a straight line is a mere hope.
 LONGEST_IN_HISTORY = 2.0
+LARGEST = 1e100  # of a number in its unit, and of its inverse: squares of greater ones are not finite
 DAY_NS = 86_400_000_000_000
 
 Array = NDArray[np.float64]
@@ -65,20 +66,25 @@ def daily(t_utc_ns: Sequence[int]) -> list[int]:
 def trend(t_days: Array, values: Array, u: Array) -> Trend | None:
     """The weighted line through values (n,) with standard uncertainties u (n,) > 0 at the times t_days (n,).
 
-    None where there are fewer than POINTS_MIN points, or all at one time.
+    None where there are fewer than POINTS_MIN points, or all at one time, or the numbers are beyond any instrument.
     """
     n = len(t_days)
     if n < POINTS_MIN or not np.ptp(t_days) > 0:
         return None
-    weights = 1.0 / u**2
-    centre = np.average(t_days, weights=weights)
-    leverage = float(np.sum(weights * (t_days - centre) ** 2))
-    mean = np.average(values, weights=weights)
-    rate = float(np.sum(weights * (t_days - centre) * (values - mean))) / leverage
-    residuals = values - mean - rate * (t_days - centre)
-    birge = max(1.0, math.sqrt(float(np.sum(weights * residuals**2)) / (n - 2)))
-    random = math.sqrt((birge**2 - 1.0) * float(np.mean(u**2)))
-    return Trend(rate, birge / math.sqrt(leverage), random, n, float(np.ptp(t_days)))
+    with np.errstate(all="ignore"):
+        weights = 1.0 / u**2
+        total = np.sum(weights)
+        centre, mean = np.sum(weights * t_days) / total, np.sum(weights * values) / total
+        leverage = np.sum(weights * (t_days - centre) ** 2)
+        rate = np.sum(weights * (t_days - centre) * (values - mean)) / leverage
+        residuals = values - mean - rate * (t_days - centre)
+        birge = np.sqrt(np.sum(weights * residuals**2) / (n - 2))
+        birge = np.where(birge < 1.0, 1.0, birge)  # which keeps NaN
+        found = np.array([rate, birge / np.sqrt(leverage), np.sqrt((birge**2 - 1.0) * np.mean(u**2))])
+    if not (np.all(np.abs(found) < LARGEST) and found[1] > 1.0 / LARGEST):
+        return None
+    rate_found, u_rate, random = found.tolist()
+    return Trend(rate_found, u_rate, random, n, float(np.ptp(t_days)))
 
 
 def spread_of_rates(peers: Sequence[Trend]) -> float | None:
@@ -96,6 +102,8 @@ def advise(own: Trend | None, limit: float, spread: float | None, unit: str) -> 
     """The interval of an instrument. `limit`: greatest change that is tolerated, in `unit`; `spread`: of its peers."""
     if own is None:
         return Advice(None, f"needs calibrations of {POINTS_MIN} days")
+    if not limit < LARGEST:
+        return Advice(None, f"its U, {limit:.3g} {unit}, is beyond any instrument")
     rate, u_rate = own.rate, own.u_rate
     unlike = spread is not None and abs(rate) > UNLIKE * math.hypot(spread, u_rate)
     if spread is not None and not unlike:

@@ -6,6 +6,7 @@ import hashlib
 import hmac
 import ipaddress
 import logging
+import math
 import secrets
 import time
 from collections.abc import Awaitable, Callable
@@ -18,19 +19,22 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from agent.commanding.allowance import Allowance
+from agent.delivery.seldom import Seldom
 from agent.monitor.users import LONGEST_PASSWORD, User, Users, UsersError, password_is
 
 SESSION_S = 12 * 3600.0  # s that a login lasts: a working day
 SESSIONS_MAX = 1000  # the oldest ends when there are more
 LARGEST_LOGIN = 4096  # bytes of a request
-# Attempts to log in: some at once, then one in so many seconds. A user's password can be guessed 2,900 times a day.
-OF_ADDRESS = (10, 1 / 10)
-OF_USER = (10, 1 / 30)
-ADDRESSES_MAX = 10_000
+# Wrong passwords that cost no delay: of one user from one address, and of one address under any names. Each further one
+# doubles the delay, from 1 s on. A user at another address does not wait, so that nobody can lock a user out.
+FREE_OF_USER, FREE_OF_ADDRESS = 3, 10
+LONGEST_DELAY_S = 30.0  # 2,900 attempts a day from one address
+FORGOTTEN_S = 900.0  # s after the last wrong password, from which the next one counts as the first
+NAMES_MAX = 10_000  # users and addresses whose wrong passwords are remembered; the newest stay
 AT_ONCE = 2  # passwords that are checked at the same time, each in 64 MiB
 WAITING_MAX = 8
 TOKEN = "x-csrf-token"
+LOG_S = 60.0  # s between two lines of the log about logins that must wait
 _log = logging.getLogger(__name__)
 
 
@@ -49,20 +53,45 @@ class Session:
     ends_s: float
 
 
-class Allowances:
-    """A rate limit for each of many names; the limits of at most `most` names are kept."""
+@dataclass(frozen=True, slots=True)
+class _Failed:
+    """Wrong attempts under a name. `at_s`: of the last one; `next_s`: when the next one may be made (monotonic, s)."""
 
-    def __init__(self, burst: int, rate_hz: float, most: int) -> None:
-        self._limit, self._most = (burst, rate_hz), most
-        self._by_name: dict[str, Allowance] = {}
+    count: int
+    at_s: float
+    next_s: float
 
-    def passes(self, name: str, now_s: float) -> bool:
-        """Whether one more attempt under this name may pass; it is counted then."""
-        allowance = self._by_name.pop(name, None) or Allowance(*self._limit)
-        self._by_name[name] = allowance  # the newest last
-        if len(self._by_name) > self._most:
-            del self._by_name[next(iter(self._by_name))]
-        return allowance.passes(now_s)
+
+class Delays:
+    """How long an attempt under each of many names must wait after wrong ones. The caller gives the time, in s.
+
+    `free`: wrong attempts without delay. An attempt that must wait changes nothing, so it does not make others wait.
+    """
+
+    def __init__(self, free: int) -> None:
+        self._free = free
+        self._failed: dict[str, _Failed] = {}  # the newest last
+
+    def wait_s(self, name: str, now_s: float) -> float:
+        """Time in s until the next attempt under this name may be made; 0 if it may be now."""
+        failed = self._failed.get(name)
+        return max(0.0, failed.next_s - now_s) if failed is not None else 0.0
+
+    def begin(self, name: str, now_s: float) -> None:
+        """An attempt is made. It counts as wrong until `right`, so that many at the same time count too."""
+        before = self._failed.pop(name, None)
+        count = 1 + (before.count if before is not None and now_s - before.at_s < FORGOTTEN_S else 0)
+        doubled = min(count - self._free, 10)  # so that no number of attempts gives a large power
+        delay_s = min(2.0**doubled, LONGEST_DELAY_S) if count >= self._free else 0.0
+        self._failed[name] = _Failed(count, now_s, now_s + delay_s)
+        if len(self._failed) > NAMES_MAX:
+            del self._failed[next(iter(self._failed))]
+
+    def right(self, name: str, *, forget: bool) -> None:
+        """The attempt was right: it is no wrong one; with `forget` those before it do not count any more either."""
+        failed = self._failed.pop(name, None)
+        if failed is not None and not forget and failed.count > 1:
+            self._failed[name] = _Failed(failed.count - 1, failed.at_s, failed.at_s)
 
 
 class Access:
@@ -71,8 +100,8 @@ class Access:
     def __init__(self, users: Path | None) -> None:
         self._users = Users(users) if users is not None else None
         self._sessions: dict[bytes, Session] = {}  # by the SHA-256 of the cookie
-        self._of_address = Allowances(*OF_ADDRESS, ADDRESSES_MAX)
-        self._of_user = Allowances(*OF_USER, ADDRESSES_MAX)
+        self._of_user, self._of_address = Delays(FREE_OF_USER), Delays(FREE_OF_ADDRESS)
+        self._told = Seldom(_log, LOG_S)
         self._checking = anyio.CapacityLimiter(AT_ONCE)
 
     def reading(self, answer: Callable[[Request], Response]) -> Callable[[Request], Response]:
@@ -127,25 +156,31 @@ class Access:
         return JSONResponse(told)
 
     async def log_in(self, request: Request) -> Response:
-        """Begin a session: 401 for a wrong name or password, 429 for too many attempts."""
+        """Begin a session: 401 for a wrong name or password, 429 where the next attempt must wait."""
         try:
             asked = msgspec.json.decode(await body_of(request, LARGEST_LOGIN), type=_Login)
         except (msgspec.DecodeError, ValueError, RecursionError):
             raise HTTPException(400, "not a login") from None
         user = self._now().get(asked.name)
-        now_s = time.monotonic()
-        passes = self._of_address.passes(_network(request), now_s)
-        if not passes or not self._of_user.passes(asked.name[:LONGEST_PASSWORD], now_s):
-            _log.warning("too many attempts to log in, from %s", _network(request))
-            raise HTTPException(429, "too many attempts to log in; wait a minute", {"Retry-After": "60"})
+        address, now_s = _network(request), time.monotonic()
+        name = f"{asked.name[:LONGEST_PASSWORD]} {address}"
+        wait_s = max(self._of_user.wait_s(name, now_s), self._of_address.wait_s(address, now_s))
+        if wait_s > 0:
+            self._told.warning("a login from %s must wait after wrong passwords", address)
+            wait = str(math.ceil(wait_s))
+            raise HTTPException(429, f"wait {wait} s after so many wrong passwords", {"Retry-After": wait})
         if self._checking.statistics().tasks_waiting > WAITING_MAX:
             raise HTTPException(503, "too many logins at the same time; try again")
+        self._of_user.begin(name, now_s)
+        self._of_address.begin(address, now_s)
         right = len(asked.password) <= LONGEST_PASSWORD and await anyio.to_thread.run_sync(
             password_is, user, asked.password, limiter=self._checking
         )
         if not right or user is None:
-            _log.warning("a wrong password or user name, from %s", _network(request))
+            _log.warning("a wrong password or user name, from %s", address)
             raise HTTPException(401, "the name or the password is wrong")
+        self._of_user.right(name, forget=True)
+        self._of_address.right(address, forget=False)  # of a guesser who is a user too
         return self._begin(request, user)
 
     def log_out(self, request: Request) -> Response:
@@ -187,7 +222,7 @@ async def body_of(request: Request, most: int) -> bytes:
 
 
 def _secure(request: Request) -> bool:
-    return request.url.scheme == "https"
+    return bool(request.scope["scheme"] == "https")
 
 
 def _cookie(request: Request) -> str:

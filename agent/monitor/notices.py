@@ -32,6 +32,7 @@ class Watch:
         self._fleet, self._settings, self._certificates = fleet, settings, certificates
         self._silent_since: dict[tuple[str, str], float] = {}
         self._told_silent: set[tuple[str, str]] = set()
+        self._told_doubled: set[tuple[str, str]] = set()
         self._told_certificates: dict[Path, datetime] = {}
         self._looked_s = -CERTIFICATES_S
 
@@ -50,6 +51,11 @@ class Watch:
         found = []
         for row in self._fleet.gateways({}):
             place = (row["site"], row["gateway"])
+            if row["instances"] > 1 and place not in self._told_doubled:
+                self._told_doubled.add(place)
+                found.append(Notice("gateway", "/".join(place), "more than one gateway is on the bus under this name"))
+            elif row["instances"] == 1:
+                self._told_doubled.discard(place)
             if row["alive"]:
                 self._silent_since.pop(place, None)
                 if place in self._told_silent:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 import threading
@@ -12,8 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from agent.config.tls import TlsFiles
+from agent.monitor.connections import SELDOMLY, Connections
 from agent.monitor.database import Database
 from agent.monitor.engines import open_engine
 from agent.monitor.fleet import Fleet
@@ -26,6 +30,7 @@ from agent.monitor.server import application
 from agent.monitor.settings import MonitorSettings
 from agent.monitor.summaries import Summariser
 
+PROXIES = ("127.0.0.1", "::1")  # whose X-Forwarded-For is believed with --behind-proxy
 GRACE_S = 2  # s in which answers on their way may end at Ctrl-C
 
 
@@ -85,15 +90,26 @@ def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings
         app = application(
             database, fleet, following, access, forwarding, live, stopping, web.names, settings.plan, notifier
         )
-        config = uvicorn.Config(
-            app, log_level="warning", timeout_graceful_shutdown=GRACE_S, server_header=False,
-            ssl_certfile=web.certificate, ssl_keyfile=web.key,
-            proxy_headers=web.behind_proxy, forwarded_allow_ips="127.0.0.1,::1",
-        )  # fmt: skip
+        server, bounded = web_server(app, listening, web, stopping)
         # The server raises the signal again that has ended it; SIGTERM would then end the process before what is below.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with suppress(KeyboardInterrupt):
-            _Server(config, stopping).run([listening])
+            server.run([bounded])
+
+
+def web_server(
+    app: ASGIApp, listening: socket.socket, web: Web, stopping: threading.Event
+) -> tuple[uvicorn.Server, socket.socket]:
+    """The web server of an application, and the socket with which to run it, in place of `listening`."""
+    # Outside of what tells it a proxy's client: a connection is known by its own address.
+    connections = Connections(ProxyHeadersMiddleware(app, list(PROXIES)) if web.behind_proxy else app)  # type: ignore[arg-type]
+    config = uvicorn.Config(
+        connections, log_level="warning", timeout_graceful_shutdown=GRACE_S, server_header=False,
+        ssl_certfile=web.certificate, ssl_keyfile=web.key, proxy_headers=False, loop="asyncio", http="h11", ws="none",
+    )  # fmt: skip
+    for name in ("uvicorn.error", "asyncio"):
+        logging.getLogger(name).addFilter(SELDOMLY)
+    return _Server(config, stopping), connections.listening(listening)
 
 
 def _certificates(bus: Bus, web: Web) -> list[Path]:

@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import re
+import sqlite3
 import threading
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ from starlette.types import ASGIApp
 from agent.config.files import read_file
 from agent.monitor.advising import Advisor
 from agent.monitor.database import Database
+from agent.monitor.engines import DatabaseError
 from agent.monitor.fleet import Fleet, Place
 from agent.monitor.following import Following
 from agent.monitor.forwarding import Forwarding
@@ -30,6 +32,7 @@ from agent.monitor.live import Live
 from agent.monitor.login import Access
 from agent.monitor.notices import Notifier
 from agent.monitor.settings import PICTURES, Plan
+from agent.terminal.text import no_formula
 
 PAGE = Path(__file__).parent / "page"
 TYPES = {".html": "text/html", ".svg": "image/svg+xml", ".js": "text/javascript", ".css": "text/css"}
@@ -43,6 +46,7 @@ _NUMBER = re.compile(r"[0-9]{1,9}")
 LARGEST_PICTURE = 32 << 20  # bytes
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
+ALIVE_S = 15.0  # s between two comments, which keep proxies from ending the stream, and find clients that are gone
 
 
 def application(
@@ -88,7 +92,8 @@ def application(
             Route("/api/command", forwarding.command, methods=["POST"]),
             Route("/", _file),
             Route("/{name}", _file),
-        ]
+        ],
+        exception_handlers={sqlite3.Error: _no_database, DatabaseError: _no_database},
     )
     return Guard(app, names)
 
@@ -98,6 +103,10 @@ def _file(request: Request) -> Response:
     if name not in FILES:
         return Response("no such page", 404)
     return Response((PAGE / name).read_bytes(), 200, None, FILES[name])
+
+
+def _no_database(_: Request, error: Exception) -> Response:
+    return Response(f"the database cannot be read: {error}; try again", 503)
 
 
 class _Data:
@@ -114,8 +123,7 @@ class _Data:
 
     def sensors(self, _: Request) -> Response:
         following, fleet = self._following, self._fleet
-        bus = {"fault": following.fault, "unconfirmed": following.unconfirmed, "left_out": fleet.left_out,
-               "verifies": following.keys is not None}  # fmt: skip
+        bus = following.state() | {"left_out": fleet.left_out, "verifies": following.keys is not None}
         bus["notices"] = self._notifier.fault if self._notifier is not None else ""
         told = {"sensors": fleet.rows(), "gateways": fleet.gateways(following.refused), "bus": bus}
         return _json(told | {"plan": None if self._plan is None else dict(self._plan.positions)})
@@ -183,16 +191,20 @@ class _Data:
 
     async def _tell(self) -> AsyncIterator[str]:
         me, told, benches = object(), -1, self._following.benches
-        guided = benches.version
+        guided, silent_s = benches.version, 0.0
         self._listeners.add(me)
         try:
             while not self._stopping.is_set():
+                silent_s += TELL_S
                 if self._fleet.version != told:
                     told = self._fleet.version
                     yield f"data: {told}\n\n"
                 if benches.version != guided:
                     guided = benches.version
                     yield f"event: bench\ndata: {guided}\n\n"
+                if silent_s >= ALIVE_S:
+                    silent_s = 0.0
+                    yield ": no change\n\n"
                 await asyncio.sleep(TELL_S)
         finally:
             self._listeners.discard(me)
@@ -216,7 +228,7 @@ def _csv(name: str, rows: list[dict[str, Any]]) -> Response:
     text = io.StringIO()
     columns = list(dict.fromkeys(column for row in rows for column in row))
     writer = csv.writer(text)
-    writer.writerow(columns)
+    writer.writerow(map(no_formula, columns))
     writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
     return Response(text.getvalue(), 200, {"Content-Disposition": f'attachment; filename="{name}"'}, "text/csv")
 
@@ -225,4 +237,4 @@ def _cell(value: Any) -> Any:
     """A cell. A text that a spreadsheet would take for a formula gets an apostrophe before it."""
     if isinstance(value, (list, dict)):
         value = json.dumps(value)
-    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
+    return no_formula(value) if isinstance(value, str) else value

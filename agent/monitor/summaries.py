@@ -87,11 +87,11 @@ def summarise(run: Run, day: int, sensor: int) -> None:
     )
 
 
-def split(fields: dict[str, Any]) -> tuple[dict[str, Any], bytes | None]:
+def split(what: str, fields: dict[str, Any]) -> tuple[dict[str, Any], bytes | None]:
     """The fields of a result without its detail, and the detail, packed; None where it has none."""
-    held = fields.get("calibration", fields)
-    if "covariance" not in held:
+    if what not in ("calibration", "estimate"):
         return fields, None
+    held = fields["calibration"] if what == "estimate" else fields
     shared = held.get("shared_errors", [])
     short = {name: value for name, value in held.items() if name not in DETAIL}
     short["shared_errors"] = [{name: e[name] for name in e if name not in SHARED_DETAIL} for e in shared]
@@ -100,12 +100,12 @@ def split(fields: dict[str, Any]) -> tuple[dict[str, Any], bytes | None]:
     return (short if held is fields else fields | {"calibration": short}), packed(detail)
 
 
-def merged(fields: dict[str, Any], detail: bytes | None) -> dict[str, Any]:
+def merged(what: str, fields: dict[str, Any], detail: bytes | None) -> dict[str, Any]:
     """The fields with their detail again."""
     if detail is None:
         return fields
     found = unpacked(detail)
-    held = fields.get("calibration", fields)
+    held = fields["calibration"] if what == "estimate" else fields
     shared = [a | b for a, b in zip(held["shared_errors"], found["shared_errors"], strict=True)]
     whole = held | found | {"shared_errors": shared}
     return whole if held is fields else fields | {"calibration": whole}

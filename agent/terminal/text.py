@@ -24,6 +24,11 @@ _OBEYED = re.compile(
 )
 
 
+# With which a cell begins that a spreadsheet calculates: at the beginning, or after what a spreadsheet may take for the
+# end of a cell, whatever ends it in the file (OWASP, CSV Injection; the wide forms too).
+_FORMULA = re.compile("(^|[,;\t\r\n])(?=[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20])")
+
+
 def visible(text: str) -> str:
     """The text, in which each character that a terminal obeys is written as \\uXXXX. Tabs and line feeds stay."""
     return _OBEYED.sub(_written, text)
@@ -45,6 +50,11 @@ def figure_text(text: str) -> str:
     """The text for a figure: in one line of a bounded length, and without mathematics between dollar signs."""
     text = one_line(text).replace("$", r"\$")
     return text if len(text) <= LONGEST_IN_FIGURE else f"{text[:LONGEST_IN_FIGURE]}…"
+
+
+def no_formula(text: str) -> str:
+    """The text for a table, in which an apostrophe stands before what a spreadsheet would calculate."""
+    return _FORMULA.sub(r"\1'", text)
 
 
 def say(line: str, *, err: bool = False) -> None:

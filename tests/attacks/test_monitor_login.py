@@ -123,7 +123,7 @@ def test_nothing_is_read_before_the_login_and_after_the_logout(served: Served) -
 
 
 def test_under_https_the_cookie_is_secure_and_of_this_host(site: Site, users: Path, tmp_path: Path) -> None:
-    with Served(site, tmp_path / "monitor", users=users) as served:
+    with Served(site, tmp_path / "monitor", users=users, behind_proxy=True) as served:
         body = json.dumps({"name": "anna", "password": PASSWORD})
         headers = {"Origin": f"https://{served.address}", "X-Forwarded-Proto": "https"}
         cookie = served.ask("/api/login", "POST", body, headers).headers["set-cookie"].lower()
@@ -131,21 +131,76 @@ def test_under_https_the_cookie_is_secure_and_of_this_host(site: Site, users: Pa
     assert "; secure" in cookie
 
 
-def test_passwords_cannot_be_guessed(served: Served) -> None:
-    answers = [Browser(served, "anna", f"guess number {k}").answer for k in range(12)]
-    assert [answer.status for answer in answers] == [401] * 10 + [429] * 2
-    assert answers[-1].headers["retry-after"] == "60"
+def test_each_wrong_password_makes_its_user_and_address_wait_longer(served: Served) -> None:
+    answers = [Browser(served, "anna", f"guess number {k}").answer for k in range(5)]
+    assert [answer.status for answer in answers] == [401] * 3 + [429] * 2
+    assert [answers[k].headers["retry-after"] for k in (3, 4)] == ["1", "1"]  # what must wait changes nothing
     assert Browser(served).answer.status == 429  # the right one does not pass either
+    assert Browser(served, "bob", "another long password").answer.status == 204
+    names = [Browser(served, f"invented{k}", "x" * 20).answer.status for k in range(9)]
+    assert names == [401] * 7 + [429] * 2  # ten wrong ones of one address
 
 
-def test_a_guesser_who_changes_addresses_is_limited_by_the_user() -> None:
-    allowances = login.Allowances(*login.OF_USER, most=3)
-    assert [allowances.passes("anna", 1e6) for _ in range(12)] == [True] * 10 + [False] * 2
-    assert not allowances.passes("anna", 1e6 + 29)
-    assert allowances.passes("anna", 1e6 + 31)
+def test_the_delay_doubles_to_30_s_and_ends() -> None:
+    delays, now_s, waits = login.Delays(3), 1e6, []
+    for _ in range(5000):
+        delays.begin("anna", now_s)
+        waits.append(delays.wait_s("anna", now_s))
+        now_s += waits[-1]
+    assert waits[:9] == [0, 0, 1, 2, 4, 8, 16, 30, 30]
+    assert set(waits[7:]) == {30}
+    assert delays.wait_s("anna", now_s - 30) == 30
+    assert delays.wait_s("anna", now_s) == 0
+    delays.begin("anna", now_s + login.FORGOTTEN_S)
+    assert delays.wait_s("anna", now_s + login.FORGOTTEN_S) == 0
+
+
+def test_a_right_password_ends_the_delay_of_its_user_but_frees_no_guesser() -> None:
+    user, address = login.Delays(3), login.Delays(3)
+    for now_s in (1.0, 2.0):
+        user.begin("anna", now_s)
+        address.begin("192.0.2.1", now_s)
+    user.right("anna", forget=True)
+    address.right("192.0.2.1", forget=False)
+    user.begin("anna", 3.0)
+    address.begin("192.0.2.1", 3.0)
+    address.begin("192.0.2.1", 3.0)
+    assert (user.wait_s("anna", 3.0), address.wait_s("192.0.2.1", 3.0)) == (0.0, 1.0)
+
+
+def test_invented_names_take_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(login, "NAMES_MAX", 3)
+    delays = login.Delays(1)
     for k in range(100):
-        allowances.passes(f"invented {k}", 1e6)
-    assert len(allowances._by_name) == 3
+        delays.begin(f"invented {k}", 1e6)
+    assert [delays.wait_s(f"invented {k}", 1e6) for k in range(96, 100)] == [0, 1, 1, 1]
+
+
+def test_nobody_locks_a_user_out_from_another_address(site: Site, users: Path, tmp_path: Path) -> None:
+    """Behind a proxy its client counts, the last address that the proxy itself has added."""
+    with Served(site, tmp_path / "monitor", users=users, behind_proxy=True) as served:
+
+        def login_from(address: str, password: str) -> int:
+            headers = {"Origin": f"http://{served.address}", "X-Forwarded-For": address}
+            body = json.dumps({"name": "anna", "password": password})
+            return served.ask("/api/login", "POST", body, headers).status
+
+        guesses = [login_from(f"203.0.113.{k}, 192.0.2.1", "a wrong password") for k in range(6)]
+        assert guesses == [401] * 3 + [429] * 3
+        assert login_from("192.0.2.1", PASSWORD) == 429
+        assert login_from("192.0.2.2", PASSWORD) == 204
+        assert [login_from(f"2001:db8::{k}", "a wrong password") for k in range(4)] == [401] * 3 + [429]  # one /64
+        assert [login_from("nonsense", "a wrong password") for _ in range(4)] == [401] * 3 + [429]
+
+
+def test_without_the_option_no_header_says_from_where_a_login_comes(served: Served) -> None:
+    given = {"Origin": f"http://{served.address}"}
+    answers = []
+    for k in range(5):
+        forged = {"X-Forwarded-For": f"203.0.113.{k}", "Forwarded": f"for=203.0.113.{k}", "X-Real-IP": f"203.0.113.{k}"}
+        body = json.dumps({"name": "anna", "password": "a wrong password"})
+        answers.append(served.ask("/api/login", "POST", body, given | forged).status)
+    assert answers == [401] * 3 + [429] * 2
 
 
 def test_an_unknown_user_is_answered_as_a_wrong_password(served: Served) -> None:

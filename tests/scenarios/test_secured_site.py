@@ -18,7 +18,9 @@ from agent.commanding.arguments import Hold
 from agent.commanding.envelope import Order, seal
 from agent.commanding.sending import send
 from agent.core.events import Command, RunStart
+from agent.delivery import instances
 from agent.delivery.consumer import Consumer
+from agent.delivery.instances import Instances
 from agent.delivery.session import session_config
 from agent.keys.files import read_signing_key
 from agent.recording.reading import RecordingReader
@@ -122,6 +124,24 @@ def test_nobody_but_the_gateway_answers_for_it(site: SecuredSite) -> None:
 
         wait_until(reaches, SEEN_S, "the forger's own queryable")
         assert list(operator.get(f"{KEY}/mems/command/hold", timeout=0.5)) == []
+
+
+def test_a_gateway_sees_a_copy_of_itself_and_no_other(site: SecuredSite, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instances, "TOGETHER_S", 0.0)
+    monkeypatch.setattr(instances, "LOOK_S", 0.0)
+    with site.session(GATEWAY.replace("/", ".")) as copy:
+        tokens = [copy.liveliness().declare_token(f"{KEY}/alive/{name}") for name in ("a", "b")]
+        for name, sees in ((GATEWAY, True), ("workshop/gateway-2", False), ("dashboard", True)):
+            with site.session(name.replace("/", ".")) as session:
+                watched = Instances(session, "fieldcal/v1/**" if name == "dashboard" else f"{KEY}/**")
+                end_s = time.monotonic() + (SEEN_S if sees else 0.5)
+                while not watched.doubled and time.monotonic() < end_s:
+                    watched.look()
+                    time.sleep(0.02)  # until it is seen, or would have been
+                assert set(watched.doubled) == ({GATEWAY} if sees else set()), name
+                watched.close()
+        for token in tokens:
+            token.undeclare()
 
 
 def test_commands_from_end_to_end(site: SecuredSite) -> None:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import http.client
 import json
+import resource
 import signal
 import socket
 import ssl
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, ExitStack, closing
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
-
-import uvicorn
 
 from agent.monitor.database import Database
 from agent.monitor.engines import Sqlite
@@ -25,6 +24,7 @@ from agent.monitor.following import Following
 from agent.monitor.forwarding import Forwarding
 from agent.monitor.live import Live
 from agent.monitor.login import Access
+from agent.monitor.running import Web, web_server
 from agent.monitor.server import application
 from tests.unit.zenoh_site import Site, wait_for
 
@@ -47,12 +47,13 @@ class Answer:
 class Served(AbstractContextManager["Served"]):
     """The server in a thread, on a free port of loopback, with a fleet that the test fills.
 
-    `keys`: known keys; `users`: who may log in; `more`: of the application.
+    `keys`: known keys; `users`: who may log in; `behind_proxy`: on loopback; `more`: of the application.
     """
 
     def __init__(
-        self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None, **more: Any
-    ) -> None:
+        self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None, *,
+        behind_proxy: bool = False, **more: Any,
+    ) -> None:  # fmt: skip
         self._open = ExitStack()
         directory.mkdir(exist_ok=True)
         self.database = self._open.enter_context(closing(Database(Sqlite(directory / "monitor.sqlite"))))
@@ -66,9 +67,9 @@ class Served(AbstractContextManager["Served"]):
         app = application(self.database, self.fleet, self.following, access, forwarding, live, stopping, **more)
         listening = self._open.enter_context(closing(socket.create_server(("127.0.0.1", 0))))
         self.address = f"127.0.0.1:{listening.getsockname()[1]}"
-        config = uvicorn.Config(app, log_level="error", server_header=False, timeout_graceful_shutdown=1)
-        server = uvicorn.Server(config)
-        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
+        web = Web(names=(), users=users, certificate=None, key=None, behind_proxy=behind_proxy)
+        server, bounded = web_server(app, listening, web, stopping)
+        thread = threading.Thread(target=server.run, args=([bounded],), daemon=True)
         thread.start()
 
         def stop() -> None:
@@ -100,10 +101,13 @@ class Served(AbstractContextManager["Served"]):
 
 
 class Monitor:
-    """`fieldcal monitor` in a process of its own. `ca`: the authority of its certificate, where it serves HTTPS."""
+    """`fieldcal monitor` in a process of its own. `ca`: the authority of its certificate, where it serves HTTPS.
+
+    `files`: how many it may have open.
+    """
 
     def __init__(
-        self, endpoint: str, directory: Path, *options: str, address: str = "", ca: Path | None = None
+        self, endpoint: str, directory: Path, *options: str, address: str = "", ca: Path | None = None, files: int = 0
     ) -> None:
         with closing(socket.socket()) as free:
             free.bind(("127.0.0.1", 0))
@@ -111,7 +115,9 @@ class Monitor:
         self.tls = ssl.create_default_context(cafile=ca) if ca is not None else None
         self.url = f"http{'s' if ca is not None else ''}://{self.address}"
         given = ["--connect", endpoint, "--listen", self.address, "--data-dir", str(directory), *options]
-        self._process = subprocess.Popen([sys.executable, "-m", "agent", "monitor", *given], stderr=subprocess.PIPE)
+        limit = ["prlimit", f"--nofile={files}"] if files else []
+        command = [*limit, sys.executable, "-m", "agent", "monitor", *given]
+        self._process = subprocess.Popen(command, stderr=subprocess.PIPE)
         try:
             wait_for(self._answers, STARTS_S)
         except AssertionError:
@@ -140,8 +146,20 @@ class Monitor:
         self._process.kill()
         self._process.communicate()
 
-    def stop(self, number: signal.Signals = signal.SIGINT) -> None:
-        """Ctrl-C, or another signal. Fails where the program does not end well."""
+    def stop(self, number: signal.Signals = signal.SIGINT) -> str:
+        """Ctrl-C, or another signal; returns the log. Fails where the program does not end well."""
         self._process.send_signal(number)
         said = self._process.communicate(timeout=10)[1].decode()
         assert (self._process.returncode, "Traceback" in said, "FATAL" in said) == (0, False, False), said
+        return said
+
+
+@contextmanager
+def many(address: str, count: int) -> Iterator[list[socket.socket]]:
+    """So many connections to a server, which send nothing."""
+    host, port = address.split(":")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    with ExitStack() as opened:
+        yield [opened.enter_context(socket.create_connection((host, int(port)), 10)) for _ in range(count)]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

@@ -106,6 +106,17 @@ def test_sessions_are_bounded_and_an_older_guide_changes_nothing(monkeypatch: py
     assert benches.version == version
 
 
+def test_a_guide_from_the_future_does_not_hide_those_that_follow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a clock that was put back, or a stranger where no list of keys is used."""
+    benches = Benches()
+    benches.take("site", "gw", structs.replace(GUIDE, t_utc_ns=2**62))
+    benches.take("site", "gw", structs.replace(GUIDE, stage="measuring"))
+    assert benches.rows()[0]["stage"] == "turn"  # it may be one that was recorded and sent again
+    monkeypatch.setattr(benches_module, "BACK_S", 0.0)
+    benches.take("site", "gw", structs.replace(GUIDE, stage="measuring"))
+    assert benches.rows()[0]["stage"] == "measuring"
+
+
 def test_what_is_said_long_and_often_stays_within_the_message() -> None:
     shown: list[Guide] = []
     screen = Screen("mems", Wanted(), lambda _: None, lambda _: None, lambda _: None, shown.append)

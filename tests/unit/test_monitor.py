@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.error import HTTPError
@@ -20,7 +21,7 @@ from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
-from tests.unit.monitor_site import Monitor
+from tests.unit.monitor_site import Monitor, many
 
 HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
 
@@ -60,7 +61,10 @@ def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway:
 
 
 def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(tmp_path: Path) -> None:
-    """While no router answers: Ctrl-C ends the monitor well all the same."""
+    """While no router answers: Ctrl-C ends the monitor well all the same.
+
+    And while more connections do not finish the handshake of TLS than the program may have files open.
+    """
     pytest.importorskip("argon2", reason="the extra monitor is not installed")
     from agent.monitor.users import set_user
 
@@ -71,8 +75,10 @@ def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(tmp_path: Path) ->
     set_user(tmp_path / "users.txt", "anna", (), "correct horse battery staple")
     options = ["--https-certificate", str(tmp_path / "fleet.pem"), "--https-key", str(tmp_path / "fleet.key"),
                "--users", str(tmp_path / "users.txt")]  # fmt: skip
-    monitor = Monitor("tcp/127.0.0.1:1", tmp_path / "monitor", *options, ca=tmp_path / "ca.pem")
+    monitor = Monitor("tcp/127.0.0.1:1", tmp_path / "monitor", *options, ca=tmp_path / "ca.pem", files=300)
+    idle = ExitStack()
     try:
+        idle.enter_context(many(monitor.address, 1024))
         body = json.dumps({"name": "anna", "password": "correct horse battery staple"}).encode()
         login = Request(f"{monitor.url}/api/login", body, {"Origin": monitor.url})
         with urlopen(login, timeout=10, context=monitor.tls) as answer:
@@ -85,4 +91,6 @@ def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(tmp_path: Path) ->
         with pytest.raises(HTTPError, match="401"):
             monitor.get("api/fleet")
     finally:
-        monitor.stop()
+        idle.close()
+        said = monitor.stop()
+    assert len(said) < 2000, said[:2000]

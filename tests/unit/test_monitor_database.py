@@ -105,6 +105,19 @@ def test_results_of_one_batch_are_kept_as_one_by_one(kept: Kept) -> None:
     assert kept.database.last_sequence() == {"site/gw/ab": 4, "site/gw": 5}
 
 
+def test_a_clock_that_is_set_late_costs_no_result_that_lasts(kept: Kept) -> None:
+    """A machine without a battery for its clock begins in 1970, the day that marks what lasts."""
+    kept.now_ns = HOUR_NS
+    lasting = kept.add(status(1), START)
+    for number, t_utc_ns in enumerate((0, -5 * DAY_NS, START, START + 900 * DAY_NS), start=2):
+        kept.add(calibration(number), t_utc_ns)
+    kept.now_ns = START
+    newest = kept.add(calibration(6), START)
+    assert kept.summarise() > 0
+    assert kept.rows("status") == [lasting]
+    assert kept.rows("calibration")[-1] == newest
+
+
 @pytest.mark.parametrize("broken", ["INSERT INTO result", "INSERT INTO newest", "INSERT INTO followed"])
 def test_a_batch_that_fails_leaves_nothing_and_can_be_added_again(
     kept: Kept, broken: str, monkeypatch: pytest.MonkeyPatch

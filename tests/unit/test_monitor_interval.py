@@ -32,6 +32,20 @@ def test_a_known_line_gives_the_known_interval() -> None:
     assert "limit 4 V" in advice.reason
 
 
+@pytest.mark.parametrize("number", [1e308, -1e308, 1e200, 1e154, 5e-324, 1e-200, 0.0])
+def test_numbers_beyond_any_instrument_fail_nothing(number: float) -> None:
+    """A stranger's sensor of the same kind is a peer of the others, whose advice must not fail with it."""
+    t, values, u = np.arange(5.0), np.arange(5.0) ** 2, np.full(5, 0.1)
+    sound = Trend(0.01, 0.002, 0.1, 10, 1000.0)
+    for hostile in (np.array([number, *values[1:]]), np.full(5, number)):
+        for hostile_u in (u, np.array([abs(number), *u[1:]]), np.full(5, abs(number))):
+            for line in (trend(t, hostile, u), trend(t, values, hostile_u), trend(t, hostile, hostile_u)):
+                spread = spread_of_rates([line] * 3) if line is not None else None
+                for own, limit in ((sound, 2.0), (line, 2.0), (line, 2.0 * abs(number)), (sound, math.inf)):
+                    interval = advise(own, limit, spread, "V").interval_days
+                    assert interval is None or 0.0 <= interval <= 2000.0
+
+
 def test_random_changes_are_in_the_interval() -> None:
     line = Trend(rate=0.01, u_rate=0.002, random=0.3, points=10, span_days=1000.0)
     interval = advise(line, 2.0, None, "V").interval_days

@@ -1,0 +1,137 @@
+"""Two gateways with one name, as after a memory card was copied: told to the second one, to consumers, on the page."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from contextlib import ExitStack, closing
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from agent.delivery import instances
+from agent.delivery.consumer import Consumer
+from agent.delivery.instances import Instances
+from agent.delivery.publication import Publisher
+from agent.delivery.store import Store
+from tests.unit.zenoh_site import KEY, Site, record, wait_for
+
+pytest.importorskip("starlette", reason="the extra monitor is not installed")
+pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+from agent.monitor.notices import Watch
+from agent.monitor.settings import Notices
+from tests.unit.monitor_site import Served
+
+TOGETHER_S = 0.2  # in place of 30 s
+
+
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instances, "TOGETHER_S", TOGETHER_S)
+    monkeypatch.setattr(instances, "SPREAD_S", 0.1)
+    monkeypatch.setattr(instances, "LOOK_S", 0.1)
+
+
+class Gateway:
+    """The outgoing side of an agent on a memory card."""
+
+    def __init__(self, site: Site, card: Path) -> None:
+        self.store = Store(card)
+        self.publisher = Publisher("site", "gw", [site.endpoint], self.store)
+        self.publisher.start()
+        wait_for(lambda: self.publisher.state().connected)
+
+    @property
+    def fault(self) -> str:
+        return self.publisher.state().fault
+
+    def close(self) -> None:
+        """May be called twice."""
+        self.publisher.close()
+        self.store.close()
+
+
+def test_a_copied_card_is_told_to_the_second_gateway_to_consumers_and_on_the_page(
+    site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with closing(Store(tmp_path / "card")) as store:
+        store.commit([record(store.last_sequence() + 1)])
+    shutil.copytree(tmp_path / "card", tmp_path / "copy")
+    with ExitStack() as opened:
+        served = opened.enter_context(Served(site, tmp_path / "monitor"))
+        watch = Watch(served.fleet, Notices(), [])
+        consumer = opened.enter_context(Consumer([site.endpoint]))
+        threading.Thread(target=lambda: list(consumer), daemon=True).start()
+        first = opened.enter_context(closing(Gateway(site, tmp_path / "card")))
+
+        def told() -> list[tuple[int, str]]:
+            return [(row["instances"], row["why"]) for row in served.ask("/api/fleet").json["gateways"]]
+
+        def notices() -> list[str]:
+            return [notice.text for notice in watch.update(time.monotonic(), datetime.now(UTC))]
+
+        wait_for(lambda: told() == [(1, "")])
+        version = served.fleet.version
+        second = opened.enter_context(closing(Gateway(site, tmp_path / "copy")))
+        wait_for(lambda: second.fault.startswith("2 gateways are on the bus as site/gw (runs "))
+        wait_for(lambda: [len(found) for found in consumer.doubled.values()] == [2])
+        words = "2 gateways are on the bus under this name: stop one of them, or give it another name"
+        wait_for(lambda: told() == [(2, words)])
+        assert (notices(), notices()) == (["more than one gateway is on the bus under this name"], [])
+        first.close()
+        wait_for(lambda: (second.fault, consumer.doubled, told()) == ("", {}, [(1, "")]))
+        assert served.fleet.version >= version + 2  # pages that are open learn both
+    logged = [one.getMessage() for one in caplog.records if "gateways are on the bus" in one.getMessage()]
+    assert 3 <= len(logged) <= 4  # by the consumer, the monitor, and each gateway that looks
+
+
+def test_a_restart_and_a_restored_card_are_no_second_gateway(site: Site, tmp_path: Path) -> None:
+    with closing(Gateway(site, tmp_path / "card")):
+        pass
+    shutil.copytree(tmp_path / "card", tmp_path / "copy")
+    with site.client() as session:
+        watched = Instances(session, f"{KEY}/**")
+        for card in ("card", "copy"):
+            with closing(Gateway(site, tmp_path / card)) as gateway:
+                wait_for(lambda: len(watched._since_s.get("site/gw", {})) == 1)
+                end_s = time.monotonic() + 2 * TOGETHER_S
+                while time.monotonic() < end_s:
+                    watched.look()
+                    assert (gateway.fault, watched.doubled) == ("", {})
+                    time.sleep(0.02)  # looks until the time is over in which a second one would be told
+        watched.close()
+
+
+def test_the_token_of_a_killed_run_is_no_second_gateway_while_the_router_keeps_it(site: Site) -> None:
+    with site.client() as killed, site.client() as again, site.client() as session:
+        left = killed.liveliness().declare_token(f"{KEY}/alive/killed")
+        there = again.liveliness().declare_token(f"{KEY}/alive/again")
+        watched = Instances(session, f"{KEY}/**")
+        wait_for(lambda: len(watched._since_s.get("site/gw", {})) == 2)
+        watched.look()
+        assert watched.doubled == {}
+        left.undeclare()
+        wait_for(lambda: len(watched._since_s["site/gw"]) == 1)
+        time.sleep(TOGETHER_S)  # the time after which two would be told
+        watched.look()
+        assert watched.doubled == {}
+        watched.close()
+        there.undeclare()
+
+
+def test_invented_instances_are_bounded(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instances, "GATEWAYS_MAX", 3)
+    with site.client() as stranger, site.client() as session:
+        watched = Instances(session, "fieldcal/v1/**")
+        held = [
+            stranger.liveliness().declare_token(f"fieldcal/v1/s/gw{k}/alive/{n}") for k in range(5) for n in range(20)
+        ]
+        held.append(stranger.liveliness().declare_token("fieldcal/v1/s/gw0/last"))
+        seen = {"s/gw0", "s/gw1", "s/gw2"}
+        wait_for(lambda: {s for s, found in watched._since_s.items() if len(found) == instances.INSTANCES_MAX} == seen)
+        wait_for(lambda: (watched.look(), set(watched.doubled))[1] == seen)  # type: ignore[func-returns-value]
+        assert len(watched._since_s) == 3
+        assert len(held) == 101
+        watched.close()
