@@ -70,7 +70,7 @@ class Publisher:
     `poll_s`: time in s after which a router that came back is noticed.
     `tls`: certificates, for endpoints tls/... `serve(session, open_things)` is called with each
     new session. `instance`: the id of this run, by which two gateways with one name are found
-    (agent.delivery.instances); one is drawn if it is "".
+    (agent.delivery.instances). If it is "" one is drawn, and this gateway does not look for others with its name.
     Raises ValueError for an invalid name, EndpointError for an invalid endpoint. The methods raise nothing.
     """
 
@@ -93,7 +93,7 @@ class Publisher:
         self._tls = tls
         self._poll_s = poll_s
         self._serve_more = serve
-        self._instance = instance or uuid.uuid4().hex
+        self._instance, self._looks = instance or uuid.uuid4().hex, bool(instance)
         self._store = store
         self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
         self._blocks: deque[tuple[str, bytes]] = deque(maxlen=BLOCKS_MAX)
@@ -222,7 +222,7 @@ class Publisher:
         connected = bool(session.info.routers_zid())
         if connected and not self._connected:
             self._stop.wait(SETTLE_S)
-            if self._name_watch.ident is None:
+            if self._looks and self._name_watch.ident is None:
                 self._name_watch.start()
         self._connected = connected
         return connected

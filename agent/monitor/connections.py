@@ -27,6 +27,8 @@ HEADERS_S = 10.0  # s for the headers of a request, from the beginning of the co
 BODY_S = 30.0  # s for the body of a request
 PIECE = 64 << 10  # bytes of an answer that are sent at a time
 SEND_S = 20.0  # s in which a client must take a piece: 3 kB/s
+SEND_BUFFER = 256 << 10  # bytes that the kernel takes of an answer; without a bound it may take some megabytes
+GONE_S = 20.0  # s after which a client whose machine acknowledges nothing counts as gone
 LOG_S = 60.0  # s between two lines of the log about connections, or between two equal ones of a library
 
 Peer = tuple[str, int]  # address and port
@@ -158,8 +160,9 @@ class _Listening(socket.socket):
         """As of every socket. Raises ConnectionAbortedError where the client is refused: the server goes on."""
         accepted, address = super().accept()
         connection = _Connection(fileno=accepted.detach())
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         connection.setsockopt(
-            socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(SEND_S * 1000)
+            socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(GONE_S * 1000)
         )  # a client that is gone
         connection.connections, connection.peer = self._connections, address[:2]
         if not self._connections.admit(connection, connection.peer):

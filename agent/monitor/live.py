@@ -46,6 +46,8 @@ class Live:
         return StreamingResponse(self._blocks(key), 200, None, "text/event-stream")
 
     async def _blocks(self, key: str) -> AsyncIterator[str]:
+        if self._streams >= STREAMS_MAX:
+            return  # many came at the same moment; a page asks again
         self._streams += 1
         try:
             with await anyio.to_thread.run_sync(zenoh.open, self._config) as session:

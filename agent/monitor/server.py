@@ -192,6 +192,8 @@ class _Data:
     async def _tell(self) -> AsyncIterator[str]:
         me, told, benches = object(), -1, self._following.benches
         guided, silent_s = benches.version, 0.0
+        if len(self._listeners) >= LISTENERS_MAX:
+            return  # many came at the same moment; a page asks again
         self._listeners.add(me)
         try:
             while not self._stopping.is_set():

@@ -6,8 +6,9 @@ import csv
 import logging
 import socket
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
-from agent.monitor import engines, following, server
+from agent.monitor import engines, following, live, server
 from agent.monitor.fleet import Fleet
 from agent.monitor.following import Following
 from tests.attacks.monitor_pages import bus, pages, shown
@@ -303,24 +304,38 @@ def test_what_is_no_request_is_refused_and_does_not_fill_the_log(
     assert served.ask("/api/fleet").status == 200
 
 
-def test_readers_who_leave_free_their_places(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("path", ["changes", "live?site=site&gateway=gw&sensor=mems"])
+def test_streams_are_bounded_also_where_many_come_at_once_and_end_with_their_readers(
+    served: Served, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
     monkeypatch.setattr(server, "LISTENERS_MAX", 3)
+    monkeypatch.setattr(live, "STREAMS_MAX", 3)
+    asked = f"GET /api/{path} HTTP/1.1\r\nHost: {served.address}\r\nConnection: close\r\n\r\n".encode()
+    for _ in range(2):
+        with ExitStack() as opened:
+            readers = [opened.enter_context(closing(connected(served))) for _ in range(20)]
+            for reader in readers:
+                reader.sendall(asked)
+            wait_for(partial(three_go_on, readers))
+
+
+def three_go_on(readers: Sequence[socket.socket]) -> bool:
+    return sum(map(goes_on, readers)) == 3
+
+
+def goes_on(reader: socket.socket) -> bool:
+    """Whether the server has not ended its answer yet."""
+    reader.setblocking(False)
+    with suppress(BlockingIOError):
+        while reader.recv(1000):
+            pass
+        return False
+    return True
+
+
+def connected(served: Served) -> socket.socket:
     host, port = served.address.split(":")
-    asked = f"GET /api/changes HTTP/1.1\r\nHost: {served.address}\r\n\r\n".encode()
-
-    def status() -> bytes:
-        with closing(socket.create_connection((host, int(port)), 5)) as connection:
-            connection.sendall(asked)
-            return connection.recv(100).split()[1]
-
-    with ExitStack() as opened:
-        for _ in range(3):
-            reader = opened.enter_context(closing(socket.create_connection((host, int(port)), 5)))
-            reader.sendall(asked)
-            assert reader.recv(100).split()[1] == b"200"
-        assert status() == b"503"
-    for _ in range(10):
-        wait_for(lambda: status() == b"200")
+    return socket.create_connection((host, int(port)), 5)
 
 
 def test_headers_are_refused_and_not_a_fault(served: Served, caplog: pytest.LogCaptureFixture) -> None:

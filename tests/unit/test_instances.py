@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
+import uuid
 from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,7 +40,7 @@ class Gateway:
 
     def __init__(self, site: Site, card: Path) -> None:
         self.store = Store(card)
-        self.publisher = Publisher("site", "gw", [site.endpoint], self.store)
+        self.publisher = Publisher("site", "gw", [site.endpoint], self.store, instance=uuid.uuid4().hex)
         self.publisher.start()
         wait_for(lambda: self.publisher.state().connected)
 
