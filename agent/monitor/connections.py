@@ -161,9 +161,7 @@ class _Listening(socket.socket):
         accepted, address = super().accept()
         connection = _Connection(fileno=accepted.detach())
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        connection.setsockopt(
-            socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(GONE_S * 1000)
-        )  # a client that is gone
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(GONE_S * 1000))
         connection.connections, connection.peer = self._connections, address[:2]
         if not self._connections.admit(connection, connection.peer):
             connection.close()
