@@ -195,6 +195,20 @@ class Database:
             self.damaged.add(number)
             return None
 
+    def first_of_day(self, site: str, gateway: str, sensor: str, what: str, t_utc_ns: int) -> dict[str, Any] | None:
+        """The first result of one kind on the day of `t_utc_ns`, which summaries keep; None where there is none.
+
+        Without what summaries leave out.
+        """
+        first = t_utc_ns // DAY_NS * (DAY_NS // HOUR_NS)
+        with self._engine.transaction() as run:
+            rows = run(
+                f"SELECT payload FROM result WHERE sensor = {_OF} AND what = :what AND hour >= :first AND hour < :next"
+                " ORDER BY number LIMIT 1",
+                site=site, gateway=gateway, name=sensor, what=what, first=first, next=first + DAY_NS // HOUR_NS,
+            )  # fmt: skip
+        return unpacked(rows[0][0]) if rows else None
+
     def summaries(self, site: str, gateway: str, sensor: str, limit: int) -> list[dict[str, Any]]:
         """The newest `limit` hours that are summarised, oldest first: `t_utc_ns` of its end, last status, counts."""
         with self._engine.transaction() as run:

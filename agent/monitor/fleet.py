@@ -1,12 +1,18 @@
-"""What the page says of each sensor and gateway now: the newest results in one row, and why a person is needed."""
+"""What the page says of each sensor and gateway now: the newest results, a kind, and why a person is needed.
+
+The kind of a sensor follows from verdicts alone: of its agent on drift and status, and from whether it is heard. The
+largest of twelve changes tells nothing: of sound parameters one exceeds its U often enough.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -22,6 +28,20 @@ GATEWAYS_MAX = 10_000
 TEXT_MAX = 500  # characters of a reason that are shown; the program's own have some 100
 EVENTS_MAX = 500  # changes of status, verdicts and commands that the page lists, the newest
 LARGEST_TOLD = 16 << 10  # bytes of what a gateway says of itself; with four devices it has 2 kB
+SILENT_INTERVALS = 3  # without a result after which a sensor is not heard
+# An interval is at least this long: an agent reports its clocks once a minute. It is the longest of the newest ones,
+# since windows come by the motion of the structure.
+INTERVAL_MIN_S, INTERVALS = 60.0, 8
+DAY_NS = 86_400_000_000_000
+LOOK_S = 1.0  # s between two looks for sensors that fell silent
+MAIN = (0, 4, 8)  # of PARAMETERS
+_MAIN_NAMES = frozenset(PARAMETERS[i] for i in MAIN)
+# Fields of a verdict that a row has.
+VERDICT = ("parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "t_utc_ns",
+           "false_alarms_a_year")  # fmt: skip
+_NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
+
+Kind = Literal["drifting", "held", "no data", "silent", "uncalibrated", "sound"]
 
 SHOWN = {"status", "calibration", "good window"}  # a sensor of which none is known, and no drift, has no row
 
@@ -44,17 +64,22 @@ class Fleet:
     sensors and gateways.
     """
 
-    def __init__(self) -> None:
-        self.version = time.time_ns() // 1_000_000  # after those before a restart, which pages that are open know
+    def __init__(self, now_ns: Callable[[], int] = time.time_ns) -> None:
+        """`now_ns`: the present, UTC."""
+        self.version = now_ns() // 1_000_000  # after those before a restart, which pages that are open know
         self.left_out = 0
+        self._now_ns = now_ns
+        self._heard: dict[Place, _Heard] = {}
+        self._silent: set[Place] = set()  # that have not been heard for SILENT_INTERVALS
+        self._looked_ns = 0
         self._newest: dict[Place, dict[str, dict[str, Any]]] = {}
         self._alive: set[tuple[str, str]] = set()
         self._told: dict[tuple[str, str], GatewayTold] = {}
         self._doubled: dict[tuple[str, str], int] = {}
         self._gateways: set[tuple[str, str]] = set()
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
-        self._made: dict[Place, tuple[str, dict[str, Any]]] = {}  # the row of each sensor, for a state of its gateway
-        self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_MAX)
+        self._made: dict[Place, dict[str, Any]] = {}  # the row of each sensor
+        self._events: dict[tuple[Place, str, str], dict[str, Any]] = {}  # the newest last
         self._alarms: deque[dict[str, Any]] = deque(maxlen=EVENTS_MAX)
         self._mutex = threading.Lock()
 
@@ -83,10 +108,12 @@ class Fleet:
             return
         with self._mutex:
             self._knows((site, gateway))
-            self._newest.setdefault((site, gateway, sensor), {})[part] = fields
+            place = site, gateway, sensor
+            self._newest.setdefault(place, {})[part] = fields
+            self._heard.setdefault(place, _Heard()).take(self._now_ns() if fresh else fields["t_utc_ns"], fresh=fresh)
+            self._silent.discard(place)
             self.version += 1
-            self._changed[site, gateway, sensor] = self.version
-            self._made.pop((site, gateway, sensor), None)
+            self._touch(place)
         if told := _told_of(what, fields):
             self.note(
                 site, gateway, sensor, what, fields["t_utc_ns"], told, alarm=fresh and _needs_a_person(what, fields)
@@ -96,12 +123,45 @@ class Fleet:
         self, site: str, gateway: str, sensor: str, what: str, t_utc_ns: int, told: str, *, alarm: bool = False
     ) -> None:
         """Add an event to the list of the newest ones; an `alarm` also to those that people are told."""
-        event = {"t_utc_ns": t_utc_ns, "site": site, "gateway": gateway, "sensor": sensor, "what": what}
+        event: dict[str, Any] = {"t_utc_ns": t_utc_ns, "site": site, "gateway": gateway, "sensor": sensor}
+        event |= {"what": what, "text": clipped(told)}
         with self._mutex:
-            self._events.append(event | {"text": clipped(told)})
+            same = (site, gateway, sensor), what, _NUMBERS.sub("", told)
+            before = self._events.pop(same, {"first_utc_ns": t_utc_ns, "count": 0})
+            self._events[same] = event | {"first_utc_ns": before["first_utc_ns"], "count": before["count"] + 1}
+            if len(self._events) > EVENTS_MAX:
+                del self._events[next(iter(self._events))]
             if alarm:
-                self._alarms.append(self._events[-1])
+                self._alarms.append(event)
             self.version += 1
+
+    def look(self) -> None:
+        """See which sensors are not heard any more, at most once in LOOK_S."""
+        with self._mutex:
+            now_ns = self._now_ns()
+            if now_ns - self._looked_ns < LOOK_S * 1e9:
+                return
+            self._looked_ns = now_ns
+            silent = {place for place, heard in self._heard.items() if heard.silent(now_ns)}
+            if silent != self._silent:
+                self.version += 1
+                for place in silent ^ self._silent:
+                    self._touch(place)
+                self._silent = silent
+
+    def verdicts(self, place: Place) -> list[dict[str, Any]]:
+        """The newest verdicts on a sensor's parameters that drift or stepped."""
+        with self._mutex:
+            return _verdicts(self._newest.get(place, {}))
+
+    def beside(self, place: Place) -> dict[str, int]:
+        """Of the other sensors whose newest windows had the same reference: how many there are (`count`), and how many
+        of them have a main sensitivity that drifts or stepped (`changed`)."""
+        with self._mutex:
+            own = _reference(self._newest.get(place, {}))
+            others = [n for p, n in self._newest.items() if p != place and own and _reference(n) == own]
+        changed = sum(any(v["parameter"] in _MAIN_NAMES for v in _verdicts(newest)) for newest in others)
+        return {"count": len(others), "changed": changed}
 
     def peers(self, place: Place, most: int) -> list[Place]:
         """At most so many other sensors of the same kind of device (the first word of the identity)."""
@@ -113,9 +173,9 @@ class Fleet:
         return sorted(p for p, kind in kinds.items() if kind == own and own)[:most]
 
     def events(self) -> list[dict[str, Any]]:
-        """The newest events, the newest first."""
+        """The newest events, the newest first. What was said again with other numbers is one event with a `count`."""
         with self._mutex:
-            return list(reversed(self._events))
+            return list(reversed(self._events.values()))
 
     def alarms(self) -> list[dict[str, Any]]:
         """The alarms since the last call, the oldest first."""
@@ -132,6 +192,7 @@ class Fleet:
             elif not alive:
                 self._alive.discard((site, gateway))
             self.version += 1
+            self._touch_gateway((site, gateway))
 
     def set_doubled(self, doubled: Mapping[str, int]) -> None:
         """The gateways (`<site>/<gateway>`) of which more than one is on the bus, with their numbers."""
@@ -151,19 +212,19 @@ class Fleet:
         with self._mutex:
             if self._knows((site, gateway)):
                 before, self._told[site, gateway] = self._told.get((site, gateway)), told
-                self.version += before is None or (before.state, before.reasons) != (told.state, told.reasons)
+                if before is None or (before.state, before.reasons) != (told.state, told.reasons):
+                    self.version += 1
+                    self._touch_gateway((site, gateway))
 
-    def rows(self) -> list[dict[str, Any]]:
-        """One row for each sensor; those that need a person first, then by the worst change."""
+    def rows(self, since: int = 0) -> list[dict[str, Any]]:
+        """One row for each sensor that has changed after the version `since`, by site, gateway and name."""
         with self._mutex:
             rows = [
                 self._row_of(place)
                 for place, newest in self._newest.items()
-                if any(part in SHOWN or part.startswith("drift ") for part in newest)
+                if self._changed[place] > since and any(part in SHOWN or part.startswith("drift ") for part in newest)
             ]
-        return sorted(
-            rows, key=lambda r: (not r["why"], -(r["change_in_u"] or 0), r["site"], r["gateway"], r["sensor"])
-        )
+        return sorted(rows, key=lambda r: (r["site"], r["gateway"], r["sensor"]))
 
     def gateways(self, refused: Mapping[str, int]) -> list[dict[str, Any]]:
         """One row for each gateway; those that need a person first. `refused`: results not verified, by gateway."""
@@ -177,14 +238,20 @@ class Fleet:
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
 
     def _row_of(self, place: Place) -> dict[str, Any]:
-        state = self._state_of(place[:2])
-        made = self._made.get(place)
-        if made is None or made[0] != state:
-            if made is not None:
-                self._changed[place] = self.version
-            row = _row(place, self._newest[place], state) | {"changed": self._changed[place]}
-            made = self._made[place] = state, row
-        return made[1]
+        if place not in self._made:
+            heard = place not in self._silent and place[:2] in self._alive
+            of = {"heard_utc_ns": self._heard[place].at_ns, "changed": self._changed[place]}
+            self._made[place] = _row(place, self._newest[place], self._state_of(place[:2]), heard=heard) | of
+        return self._made[place]
+
+    def _touch(self, place: Place) -> None:
+        self._changed[place] = self.version
+        self._made.pop(place, None)
+
+    def _touch_gateway(self, gateway: tuple[str, str]) -> None:
+        for place in self._newest:
+            if place[:2] == gateway:
+                self._touch(place)
 
     def _state_of(self, gateway: tuple[str, str]) -> str:
         if gateway not in self._alive:
@@ -210,29 +277,88 @@ def _told_of(what: str, fields: dict[str, Any]) -> str:
     return f"{fields['parameter']} {fields['verdict']}: {fields['reason']}" if what == "drift" else ""
 
 
-def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str) -> dict[str, Any]:
-    status = newest.get("status", {})
-    drifts = [f for part, f in newest.items() if part.startswith("drift ") and f["verdict"] != "stable"]
-    calibration = newest.get("calibration", {})
-    changes = [(_in_u(drift, calibration.get("standard_uncertainty")), drift) for drift in drifts]
-    worst = max(changes, key=lambda change: change[0], default=None)
-    why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for _, drift in changes]
+class _Heard:
+    """When something of a sensor came last, and the intervals between what came."""
+
+    def __init__(self) -> None:
+        self.at_ns = 0
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
+
+    def take(self, at_ns: int, *, fresh: bool) -> None:
+        # Results of one window come together.
+        if fresh and self._intervals and at_ns - self.at_ns < 1e9:
+            return
+        if fresh:
+            self._intervals.append((at_ns - self.at_ns) / 1e9 if self._intervals else 0.0)
+        self.at_ns = max(self.at_ns, at_ns)
+
+    def silent(self, now_ns: int) -> bool:
+        # Until two results came nobody knows the interval; then the presence of the gateway alone tells.
+        known = len(self._intervals) > 1
+        return known and now_ns - self.at_ns > SILENT_INTERVALS * max(INTERVAL_MIN_S, *self._intervals) * 1e9
+
+
+def _reference(newest: Mapping[str, dict[str, Any]]) -> str:
+    """The reference of the newest window; "" where there is none."""
+    return str((newest.get("calibration", {}).get("references") or [""])[-1])
+
+
+def _verdicts(newest: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    return [f for part, f in newest.items() if part.startswith("drift ") and f["verdict"] != "stable"]
+
+
+def kind_of(verdicts: int, status: str, *, heard: bool) -> Kind:
+    """The kind of a sensor: what it counts as on the page. `verdicts`: of drifts and steps."""
+    if not heard:
+        return "silent"
+    if verdicts:
+        return "drifting"
+    return _OF_STATUS.get(status, "uncalibrated")
+
+
+_OF_STATUS: dict[str, Kind] = {"VALID": "sound", "RECALIBRATING": "sound", "HELD": "held", "INVALID": "no data"}
+
+
+def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *, heard: bool) -> dict[str, Any]:
+    status, calibration = newest.get("status", {}), newest.get("calibration", {})
+    verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
+    why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
     if status.get("status") in NEEDS_A_PERSON:
         why.insert(0, f"{status['status']}: {status['reason']}")
     if gateway_state == "silent":
         why.append("the gateway is not on the bus")
-    good = newest.get("good window", {})
+    elif not heard:
+        why.append(f"no result for {SILENT_INTERVALS} intervals")
     return {
         "site": place[0],
         "gateway": place[1],
         "sensor": place[2],
+        "kind": kind_of(len(verdicts), status.get("status", ""), heard=heard),
         "status": status.get("status", ""),
+        "status_utc_ns": status.get("t_utc_ns"),
+        "reason": clipped(status.get("reason", "")),
         "gateway_state": gateway_state,
-        "change_in_u": None if worst is None else worst[0],
-        "last_good_utc_ns": good.get("t_utc_ns"),
+        "verdicts": [{name: drift[name] for name in VERDICT} for drift in verdicts],
+        "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
+        "u_pct": _u_pct(calibration),
+        "band_hz": calibration.get("valid_band_hz", []),
+        "reference": clipped(_reference(newest)),
+        "estimate": newest.get("estimate", {}).get("sequence"),
+        "estimate_utc_ns": newest.get("estimate", {}).get("t_utc_ns"),
+        "last_good_utc_ns": newest.get("good window", {}).get("t_utc_ns"),
+        "result_utc_ns": max(fields["t_utc_ns"] for fields in newest.values()),
         "verified": bool(newest) and all(fields.get("signed_by") for fields in newest.values()),
         "why": "; ".join(clipped(reason) for reason in why),
     }
+
+
+def _u_pct(calibration: Mapping[str, Any]) -> float | None:
+    """The largest U (k = 2) of a main sensitivity, in % of it; None where none is known."""
+    if not calibration:
+        return None
+    values, u = calibration["sensitivity"], calibration["standard_uncertainty"]
+    found = [200.0 * u[i] / abs(s) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None]
+    return max((each for each in found if math.isfinite(each)), default=None)
 
 
 def _gateway_row(
@@ -269,9 +395,11 @@ def _place(source: str) -> tuple[str, str]:
     return site, gateway
 
 
-def _in_u(drift: dict[str, Any], standard_uncertainty: list[float | None] | None) -> float:
-    """|change| over U (k = 2) of the parameter in the calibration in force, at most LARGEST; 0 where not known."""
-    names = list(PARAMETERS)
-    change, name = drift["change"], drift["parameter"]
-    u = standard_uncertainty[names.index(name)] if standard_uncertainty and name in names else None
-    return min(abs(change) / (2 * u), LARGEST) if u and change is not None else 0.0
+def _in_u(drift: dict[str, Any], calibration: Mapping[str, Any]) -> float:
+    """The size of a change over U (k = 2) of the parameter in force, at most LARGEST; 0 where not known. A drift has
+    gone on since its verdict."""
+    change, rate = abs(drift["change"] or 0.0), abs(drift["rate"] or 0.0)
+    if drift["verdict"] == "drifting" and calibration:
+        change = max(change, rate * (calibration["t_utc_ns"] - drift["onset_utc_ns"]) / DAY_NS)
+    u = calibration["standard_uncertainty"][PARAMETERS.index(drift["parameter"])] if calibration else None
+    return min(change / (2 * u), LARGEST) if u else 0.0

@@ -9,12 +9,14 @@ import json
 import re
 import sqlite3
 import threading
+import time
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from starlette.applications import Starlette
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
@@ -32,6 +34,7 @@ from agent.monitor.live import Live
 from agent.monitor.login import Access
 from agent.monitor.notices import Notifier
 from agent.monitor.settings import PICTURES, Plan
+from agent.monitor.trends import Trends
 from agent.terminal.text import no_formula
 
 PAGE = Path(__file__).parent / "page"
@@ -40,10 +43,12 @@ FILES = {path.name: TYPES[path.suffix] for path in PAGE.iterdir() if path.suffix
 HISTORY_MAX = 2000  # results of one kind that a page or a CSV file holds
 PLOTTED = (
     "t_utc_ns", "sensitivity", "offset", "standard_uncertainty", "output_unit", "reference_temperature_degc",
-    "temperature_low_degc", "temperature_high_degc",
+    "temperature_low_degc", "temperature_high_degc", "references", "made_sequence",
 )  # fmt: skip
 _NUMBER = re.compile(r"[0-9]{1,9}")
+_VERSION = re.compile(r"[0-9]{1,18}")
 LARGEST_PICTURE = 32 << 20  # bytes
+SEEN_MAX = 50  # sensors of which a page asks at once
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
 ALIVE_S = 15.0  # s between two comments, which keep proxies from ending the stream, and find clients that are gone
@@ -70,6 +75,7 @@ def application(
     app = Starlette(
         routes=[
             Route("/api/fleet", access.reading(data.sensors)),
+            Route("/api/trends", access.reading(data.trends)),
             Route("/api/history", access.reading(data.history)),
             Route("/api/spread", access.reading(data.spread)),
             Route("/api/hours", access.reading(data.hours)),
@@ -95,7 +101,7 @@ def application(
         ],
         exception_handlers={sqlite3.Error: _no_database, DatabaseError: _no_database},
     )
-    return Guard(app, names)
+    return Guard(GZipMiddleware(app, compresslevel=1), names)
 
 
 def _file(request: Request) -> Response:
@@ -118,15 +124,23 @@ class _Data:
     ) -> None:  # fmt: skip
         self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
         self._plan, self._notifier = plan, notifier
-        self._advisor = Advisor(database, fleet)
+        self._advisor, self._trends = Advisor(database, fleet), Trends(database, fleet)
         self._listeners: set[object] = set()
 
-    def sensors(self, _: Request) -> Response:
+    def sensors(self, request: Request) -> Response:
         following, fleet = self._following, self._fleet
         bus = following.state() | {"left_out": fleet.left_out, "verifies": following.keys is not None}
         bus["notices"] = self._notifier.fault if self._notifier is not None else ""
-        told = {"sensors": fleet.rows(), "gateways": fleet.gateways(following.refused), "bus": bus}
+        fleet.look()
+        told = {"version": fleet.version, "now_utc_ns": time.time_ns(), "sensors": fleet.rows(_since(request)),
+                "gateways": fleet.gateways(following.refused), "bus": bus}  # fmt: skip
         return _json(told | {"plan": None if self._plan is None else dict(self._plan.positions)})
+
+    def trends(self, request: Request) -> Response:
+        """Of the sensors that are seen (`of`: site/gateway/sensor, at most SEEN_MAX), what their histories tell."""
+        asked = request.query_params.getlist("of")[:SEEN_MAX]
+        places = {name: name.split("/") for name in asked if name.count("/") == 2}
+        return _json({name: self._trends.of((a, b, c)) for name, (a, b, c) in places.items()})
 
     def plan(self, _: Request) -> Response:
         if self._plan is None:
@@ -198,6 +212,7 @@ class _Data:
         try:
             while not self._stopping.is_set():
                 silent_s += TELL_S
+                self._fleet.look()
                 if self._fleet.version != told:
                     told = self._fleet.version
                     yield f"data: {told}\n\n"
@@ -215,6 +230,11 @@ class _Data:
 def _place(request: Request) -> Place:
     site, gateway, sensor = (request.query_params.get(name, "") for name in ("site", "gateway", "sensor"))
     return site, gateway, sensor
+
+
+def _since(request: Request) -> int:
+    since = request.query_params.get("since", "")
+    return int(since) if _VERSION.fullmatch(since) else 0
 
 
 def _limit(request: Request) -> int:

@@ -1,7 +1,8 @@
 """What is kept of older results: hourly summaries, made in steps by a thread of the monitor.
 
-Of each hour the last calibration and the last estimate stay, without their covariances, and the counts. The newest
-result of each kind stays as it is, and so do all results of kinds that a person may have to read.
+Of each hour the last calibration and the last estimate stay, and of each day the first one, which has the budget; all
+without their covariances. So do the counts. The newest result of each kind stays as it is, and so do all results of
+kinds that a person may have to read.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ def summarise(run: Run, day: int, sensor: int) -> None:
         f"UPDATE result SET day = {LASTING}, detail = CASE WHEN number IN {newest} THEN detail END"
         f" WHERE sensor = :sensor AND day = :day AND (number IN {newest} OR number IN"
         " (SELECT max(number) FROM result WHERE sensor = :sensor AND day = :day"
-        " AND what IN ('calibration', 'estimate') GROUP BY what, hour))",
+        " AND what IN ('calibration', 'estimate') GROUP BY what, hour UNION SELECT min(number) FROM result WHERE"
+        " sensor = :sensor AND day = :day AND what IN ('calibration', 'estimate') GROUP BY what))",
         **of,
     )
 

@@ -39,6 +39,11 @@ RESPONSE = [
      "sensitivity_im": np.zeros((3, 3)).tolist(), "standard_uncertainty": np.full((3, 3), 20.0).tolist()}
     for low in (1.0, 3.0, 9.0)
 ]  # fmt: skip
+DESK, TABLET, PHONE = ({"width": width, "height": 900} for width in (1440, 820, 390))
+VIEWS: dict[str, tuple[dict[str, int], str]] = {
+    "fleet": (DESK, "light"), "fleet-dark": (DESK, "dark"), "fleet-tablet": (TABLET, "light"),
+    "fleet-phone": (PHONE, "light"),
+}  # fmt: skip
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
 
@@ -119,23 +124,38 @@ class CommandedGateway:
         self._store.close()
 
 
+def ask(page: Any) -> list[dict[str, str]]:
+    """What one screen says of the five worst: which (`who`, `kind`), since when, how sure and why (`say`, `more`), and
+    what next (`next`). Only what a person sees without scrolling."""
+    found: list[dict[str, str]] = page.evaluate(
+        """() => [...document.querySelectorAll('#cards .card')].filter((card) => {
+            const { top, bottom } = card.getBoundingClientRect();
+            return top >= 0 && bottom <= innerHeight;
+        }).map((card) => ({ who: card.querySelector('h3 a')?.textContent ?? card.querySelector('h3').textContent,
+            kind: card.querySelector('.chip').textContent, say: card.querySelector('.say').textContent,
+            more: card.querySelector('.more').textContent, next: card.querySelector('.do').textContent }))"""
+    )
+    return found
+
+
 def write_pictures() -> None:
-    """The page with a fleet of 300 days: fleet and sensor, on a desk, on a phone, and dark."""
+    """The page with a fleet of 300 days: the fleet at three widths and dark, a sensor on a desk, light and dark."""
     site = Site()
-    views = {"fleet": ({"width": 1280, "height": 800}, "light"), "fleet-dark": ({"width": 1280, "height": 800}, "dark"),
-             "fleet-phone": ({"width": 390, "height": 800}, "light")}  # fmt: skip
     with tempfile.TemporaryDirectory() as directory, page_site(site, Path(directory)) as shown, chromium() as browser:
         shown.rounds(30)
-        for name, (viewport, scheme) in views.items():
+        for name, (viewport, scheme) in VIEWS.items():
             watched = Watched(browser, shown.served.address, viewport=viewport, color_scheme=scheme)
             page = watched.open()
-            page.locator("#rows tr").nth(15).wait_for()
+            page.locator("#cards svg").first.wait_for()
+            page.wait_for_timeout(500)  # of drawing
             page.screenshot(path=IMAGES / f"{name}.png")
-            if name != "fleet-phone":
-                page.locator("#rows a").first.click()
-                page.locator("#details table").first.wait_for()
-                page.wait_for_timeout(300)  # of drawing
-                page.screenshot(path=IMAGES / f"{name.replace('fleet', 'fleet-sensor')}.png")
+            if viewport is not DESK:
+                watched.close()
+                continue
+            page.locator("#cards a").first.click()
+            page.locator("#matrix table").first.wait_for()
+            page.wait_for_timeout(500)
+            page.screenshot(path=IMAGES / f"{name.replace('fleet', 'fleet-sensor')}.png")
             watched.close()
     site.kill()
 

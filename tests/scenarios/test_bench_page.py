@@ -20,7 +20,7 @@ pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 pytest.importorskip("argon2", reason="the extra monitor is not installed")
 from tests.scenarios.bench_page import RECORD, VIEW, session
 from tests.scenarios.processes import ROOT
-from tests.scenarios.test_fleet_page import serious_faults
+from tests.scenarios.test_fleet_page import faults
 from tests.unit.monitor_site import Monitor
 
 pytestmark = needs_chromium
@@ -61,7 +61,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
                 texts = page.locator("#bench-warnings li").all_inner_texts()
                 assert [re.sub(r"^Stop [12]: ", "", text) for text in texts] == warned
                 assert texts[-1].startswith("Stop 2: ")
-                assert serious_faults(page) == []
+                assert faults(page) == []
             if (taken := re.search(r"stop 1, (.*): U is now", told)) is not None:  # the page told U in each second
                 stay = re.compile(rf"At {taken[1]}[2-9] s of 4 to 60 s; U will be \d")
                 assert any(map(stay.match, page.evaluate("() => window.seen")))
@@ -85,7 +85,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
         ]
         assert page.locator("#bench-silent").inner_text() == ""
         assert page.locator("#bench-plot .uplot").count() == 1
-        assert serious_faults(page) == []
+        assert faults(page) == []
         saved = monitor.get("bench.csv?site=virtual&gateway=bench").splitlines()
         assert saved[0] == "stop,position,u_main_pct,u_transverse_pct"
         assert [line.split(",")[1] for line in saved[1:]] == [row[1] for row in now]
@@ -93,7 +93,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 390
         page.emulate_media(color_scheme="dark")
         page.wait_for_function("() => getComputedStyle(document.body).backgroundColor === 'rgb(18, 18, 18)'")
-        assert serious_faults(page) == []
+        assert faults(page) == []
         watched.close()  # no request to outside, no error
     finally:
         monitor.stop()

@@ -78,7 +78,7 @@ function showGuide(guide, place) {
 }
 
 // Shows the session of the address, or the one that was heard last.
-export async function showBench() {
+export async function show() {
   const given = view(), named = given.has("gateway"), is = (b) => b.site === given.get("site") && b.gateway === given.get("gateway");
   const { benches } = await get("api/bench"), chosen = named ? benches.find(is) : benches[0], place = chosen ? placeOf(chosen).toString() : "";
   const guide = chosen ? (await get(`api/bench?${place}`)).guide : null, others = benches.filter((b) => b !== chosen);
@@ -91,6 +91,6 @@ export async function showBench() {
   showGuide(guide ?? EMPTY, place);
 }
 
-export function leaveBench() {
+export function leave() {
   shown = {};
 }

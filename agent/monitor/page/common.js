@@ -15,19 +15,9 @@ export function make(tag, children = [], attributes = {}) {
   return element;
 }
 
-export function ago(ns) {
-  if (!ns) return "never";
-  const s = Math.max(0, Date.now() / 1000 - ns / 1e9);
-  if (s < 120) return `${Math.round(s)} s`;
-  if (s < 7200) return `${Math.round(s / 60)} min`;
-  return s < 172800 ? `${Math.round(s / 3600)} h` : `${Math.round(s / 86400)} d`;
-}
-
-// UTC of a result. A stranger may send times that no date can hold.
-export const at = (ns) => (Math.abs(ns) > 8e21 ? "no time" : new Date(ns / 1e6).toISOString().slice(0, 19).replace("T", " "));
-
 // The view is in the address behind #, so that a link keeps it.
 export const view = () => new URLSearchParams(location.hash.slice(1));
+export const full = (row) => `${row.site}/${row.gateway}/${row.sensor}`;
 export const placeOf = (row) => new URLSearchParams({ site: row.site, gateway: row.gateway, sensor: row.sensor });
 
 export class NeedsLogin extends Error {}

@@ -1,5 +1,5 @@
 // The rows of S in space, as Figure 6 of the paper draws them: without transverse sensitivities each would lie on its axis.
-import { COLOURS } from "./plots.js";
+import { colours } from "./plots.js";
 
 const SIZE = 320, TURN = (38 * Math.PI) / 180, TILT = (22 * Math.PI) / 180;
 
@@ -10,7 +10,7 @@ function project([x, y, z]) {
 }
 
 export function drawRows(canvas, S) {
-  const ratio = devicePixelRatio || 1, context = canvas.getContext("2d"), reach = 1.2 * Math.max(...S.map((row, i) => Math.abs(row[i] ?? 0)));
+  const ratio = devicePixelRatio || 1, context = canvas.getContext("2d"), COLOURS = colours(), reach = 1.2 * Math.max(...S.map((row, i) => Math.abs(row[i] ?? 0)));
   Object.assign(canvas, { width: SIZE * ratio, height: SIZE * ratio });
   const place = (vector) => project(vector.map((v) => (v ?? 0) / (reach || 1))).map((v) => (SIZE / 2 + 0.45 * SIZE * v) * ratio);
   const line = (from, to, colour, dash = []) => {

@@ -1,81 +1,259 @@
-// The fleet view: sensors with what needs a person on top, the plan of the structure, gateways; and the events view.
-import { $, ago, at, make, placeOf, table, text, view } from "./common.js";
+// The fleet view: counts by kind, cards of what needs a person, all sensors by gateway, and the gateways.
+import { $, clean, full, get, make, placeOf, table, text, view } from "./common.js";
+import { ago, AXES, band, day, DAY_NS, finite, MAIN, now, signed, two } from "./format.js";
+import { card, chip, KINDS, spark, tile } from "./parts.js";
 import { saveTable } from "./picture.js";
+import { cardPlot, steps, told as toldOf } from "./words.js";
 
-const ROWS_MAX = 500; // sensors that the table shows at once; the filters find the others
-const HEALTH = ["silent", "degraded", "starting", "stopping", "", "running"];
-const full = (r) => `${r.site}/${r.gateway}/${r.sensor}`;
-const COLUMNS = [
-  ["sensor", "Sensor", full],
-  ["status", "Status", (r) => r.status],
-  ["change", "Change in U", (r) => r.change_in_u ?? -1],
-  ["age", "Last good window", (r) => -(r.last_good_utc_ns ?? 0)],
-  ["gateway", "Gateway", (r) => HEALTH.indexOf(r.gateway_state)],
-  ["why", "Why a person is needed", (r) => r.why],
-];
-const FIELDS = ["filter", "status", "health", "change", "age"];
+const WORST = ["drifting", "held", "no data", "silent", "uncalibrated"]; // kinds that need a person, the worst first
+const CARDS = 5; // that are shown at once; more by a button
+const SCALE_PCT = 1; // of the small plots of the table, all alike
+const AGAIN_MS = 60000; // after which the histories of rows that are seen are asked for again
+const ASKED = 25; // sensors in one question
+const GATEWAYS_MAX = 500; // rows of the table of gateways
+let shownCards = CARDS;
+const groups = new Map(); // by site/gateway: {element, body, rows, built, open}
+const trends = new Map(); // by name: {at, told}; what the histories of seen sensors tell
+const cards = new Map(); // by key: {element, from}
 
-function wanted(row, now) {
-  const words = (now.get("filter") ?? "").toLowerCase(), status = now.get("status"), health = now.get("health");
-  const change = Number(now.get("change")), age = Number(now.get("age"));
-  return `${full(row)} ${row.status} ${row.why}`.toLowerCase().includes(words)
-    && (!status || (status === "person" ? row.why !== "" : row.status === status))
-    && (!health || row.gateway_state === health)
-    && !(change > 0 && !((row.change_in_u ?? 0) >= change))
-    && !(age > 0 && !(Date.now() / 1000 - (row.last_good_utc_ns ?? 0) / 1e9 >= age * 3600));
+const gatewayOf = (row) => `${row.site}/${row.gateway}`;
+const put = (element, content) => { if (element.textContent !== content) element.replaceChildren(text(content)); };
+
+function wanted(row, filter) {
+  return (!filter.kind || row.kind === filter.kind) && (!filter.words || `${full(row)} ${row.kind} ${row.reference} ${row.why}`.toLowerCase().includes(filter.words));
 }
 
-function rowOf(row, verifies) {
-  return make("tr", [
-    make("td", make("a", full(row), { href: `#${placeOf(row)}` })),
-    make("td", row.status + (verifies && !row.verified ? " (not verified)" : "")),
-    make("td", row.change_in_u === null ? "" : row.change_in_u.toFixed(1), { class: "number", "data-title": "change in U" }),
-    make("td", ago(row.last_good_utc_ns), { class: "number", "data-title": "last good window" }),
-    make("td", row.gateway_state || "on the bus", { class: "short", "data-title": "gateway" }),
-    make("td", row.why, { class: "why" }),
-  ]);
+// --- counts
+
+function showCounts(sensors, kind, go) {
+  const count = (one) => sensors.filter((row) => row.kind === one).length;
+  const kinds = ["sound", "drifting", "held", "silent", ...["no data", "uncalibrated"].filter(count)];
+  const key = JSON.stringify([kinds.map(count), sensors.length, kind]);
+  if ($("counts").dataset.key === key) return;
+  const focused = [...$("counts").children].indexOf(document.activeElement);
+  $("counts").dataset.key = key;
+  $("counts").replaceChildren(tile("sensors", sensors.length, "", !kind, () => go({ kind: "" })),
+    ...kinds.map((one) => tile(KINDS[one][0], count(one), count(one) ? KINDS[one][1] : "", kind === one, () => go({ kind: kind === one ? "" : one }))));
+  $("counts").children[focused]?.focus();
 }
 
-export function showFleet(told) {
-  const now = view(), column = COLUMNS.find(([id]) => id === now.get("sort")), down = now.get("down") === "1";
-  for (const name of FIELDS) if ($(name).value !== (now.get(name) ?? "")) $(name).value = now.get(name) ?? "";
-  const rows = told.sensors.filter((row) => wanted(row, now));
-  if (column) rows.sort((a, b) => (column[2](a) < column[2](b) ? -1 : column[2](a) > column[2](b) ? 1 : 0) * (down ? -1 : 1));
-  COLUMNS.forEach(([id], i) => $("heads").children[i].setAttribute("aria-sort", now.get("sort") !== id ? "none" : down ? "descending" : "ascending"));
-  const focused = $("rows").contains(document.activeElement) ? document.activeElement.getAttribute("href") : null;
-  $("rows").replaceChildren(...rows.slice(0, ROWS_MAX).map((row) => rowOf(row, told.bus.verifies)));
-  if (focused) [...$("rows").querySelectorAll("a")].find((link) => link.getAttribute("href") === focused)?.focus();
-  $("more").replaceChildren(text(rows.length > ROWS_MAX ? `${rows.length - ROWS_MAX} more sensors; filter to see them` : ""));
-  showPlan(told.plan, rows);
-  $("gateways").replaceChildren(table("Gateways", ["Gateway", "On the bus", "State", "Sensors", "Version", "Why a person is needed"],
-    told.gateways.slice(0, ROWS_MAX).map((g) => [`${g.site}/${g.gateway}`, g.alive ? "yes" : "no", g.state, g.sensors, g.version, make("span", g.why, { class: "why" })])));
+// --- cards
+
+// A card for each sensor, or for a gateway whose sensors are not heard; the worst first.
+function needs(sensors, gateways) {
+  const rank = (row) => WORST.indexOf(row.kind), found = [];
+  const silent = Map.groupBy(sensors.filter((row) => row.kind === "silent"), gatewayOf);
+  for (const row of sensors.filter((one) => rank(one) >= 0 && one.kind !== "silent")) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? 0 });
+  for (const [name, rows] of silent) found.push({ key: `gateway ${name}`, row: rows[0], rows, rank: WORST.indexOf("silent"), size: rows.length });
+  for (const gateway of gateways.filter((g) => g.why && g.alive)) found.push({ key: `state ${gatewayOf(gateway)}`, gateway, rank: WORST.length, size: 0 });
+  return found.sort((a, b) => a.rank - b.rank || b.size - a.size || (a.key < b.key ? -1 : 1));
 }
 
-// Sensors as points on the picture of the structure. Positions are fractions of its width and height.
-function showPlan(plan, rows) {
-  if (!plan) return;
-  const points = rows.filter((row) => plan[full(row)]).map((row) => {
-    const [x, y] = plan[full(row)], point = make("a", "", { href: `#${placeOf(row)}`, class: row.why ? "point alarm" : "point", title: `${full(row)}: ${row.why || row.status}`, "aria-label": `${full(row)}: ${row.why || row.status}` });
-    point.style.left = `${100 * x}%`;
-    point.style.top = `${100 * y}%`;
-    return point;
+function drawn({ row, rows, gateway }) {
+  if (gateway) return card({ kind: "gateway", name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`, say: gateway.why, more: [], plot: [], steps: [make("p", "The state of a gateway says what to do: see docs/operation.md.")] });
+  const found = trends.get(full(row))?.told, { say, more } = toldOf(row, found);
+  if (rows) {
+    const moved = rows.filter((one) => one.verdicts.length).map((one) => one.sensor), names = rows.slice(0, 6).map((one) => one.sensor).join(", ");
+    return card({ kind: "silent", name: `gateway ${gatewayOf(row)}`, where: `${rows.length} sensors: ${names}${rows.length > 6 ? ", …" : ""}`, say, more: moved.length ? `Before it fell silent ${moved.slice(0, 6).join(", ")} drifted.` : "Before it fell silent no drift was found.", plot: [], steps: steps(row, found) });
+  }
+  const name = make("a", `${clean(row.gateway)} / ${clean(row.sensor)}`, { href: `#${placeOf(row)}` });
+  return card({ kind: row.kind, name, where: `${clean(row.site)}${row.reference ? `, reference ${clean(row.reference)}` : ""}`, say, more, plot: cardPlot(row, found), steps: steps(row, found) });
+}
+
+function showCards(sensors, gateways, filter) {
+  const all = needs(sensors.filter((row) => wanted(row, filter)), filter.kind || filter.words ? [] : gateways), shown = all.slice(0, shownCards);
+  $("needs").hidden = all.length === 0;
+  put($("needs-count"), `Needs a person: ${all.length}`);
+  for (const need of shown) {
+    const from = JSON.stringify([need.row?.changed, need.rows?.map((row) => row.changed), need.gateway, trends.get(need.row && full(need.row))?.at]);
+    const before = cards.get(need.key);
+    if (before?.from === from) continue;
+    const inHand = before?.element.contains(document.activeElement) || before?.element.contains(getSelection().anchorNode) && !getSelection().isCollapsed;
+    if (inHand) continue; // it is drawn anew when the person has let go of it
+    const element = drawn(need);
+    before?.element.replaceWith(element);
+    cards.set(need.key, { element, from });
+  }
+  const keys = new Set(shown.map((need) => need.key));
+  for (const [key, { element }] of cards) if (!keys.has(key)) { element.remove(); cards.delete(key); }
+  shown.forEach((need, i) => {
+    const { element } = cards.get(need.key), there = $("cards").children[i];
+    if (there !== element) $("cards").insertBefore(element, there ?? null);
   });
-  const picture = $("plan").firstChild ?? make("img", [], { src: "plan", alt: "Plan of the structure" });
-  $("plan").replaceChildren(picture, ...points);
+  $("more-cards").hidden = all.length <= shown.length;
+  put($("more-cards"), `Show ${all.length - shown.length} more`);
+  ask(shown.filter((need) => need.row && !need.rows).map((need) => need.row));
 }
 
-export function showEvents(events) {
-  $("event-rows").replaceChildren(table("Events, the newest first", ["UTC", "Sensor", "What", "Text"], events.map((e) => [
-    at(e.t_utc_ns), make("a", full(e), { href: `#${placeOf(e)}` }), e.what, e.text])));
+// --- what the histories tell, asked for when a row is seen
+
+const waiting = new Map();
+let asking = false;
+
+function ask(rows) {
+  for (const row of rows) {
+    const name = full(row), before = trends.get(name);
+    if (!before || (before.changed !== row.changed && performance.now() - before.at > AGAIN_MS) || before.kind !== row.kind) waiting.set(name, row);
+  }
+  if (!asking && waiting.size) { asking = true; setTimeout(answer, 30); }
 }
 
-// `go` changes the view in the address.
-export function startFleet(go) {
-  $("heads").replaceChildren(...COLUMNS.map(([id, title]) => make("th", make("button", title, {
-    type: "button", click: () => go({ sort: id, down: view().get("sort") === id && view().get("down") !== "1" ? "1" : "" }) }), { scope: "col" })));
-  for (const status of ["VALID", "HELD", "INVALID", "RECALIBRATING", "COLLECTING", "UNCALIBRATED"]) $("status").append(make("option", status, { value: status }));
-  for (const name of FIELDS) $(name).addEventListener("input", () => go({ [name]: $(name).value }));
+async function answer() {
+  const rows = [...waiting].slice(0, ASKED);
+  for (const [name] of rows) waiting.delete(name);
+  try {
+    const found = await get(`api/trends?${new URLSearchParams(rows.map(([name]) => ["of", name]))}`);
+    for (const [name, row] of rows) trends.set(name, { at: performance.now(), changed: row.changed, kind: row.kind, told: found[name] ?? {} });
+    for (const [name, row] of rows) groups.get(gatewayOf(row))?.built?.get(name)?.history(found[name] ?? {});
+    if (latest && rows.some(([name]) => cards.has(name))) showCards(latest.sensors, latest.gateways, filterOf());
+  } catch {
+    // The next change asks again; the page says meanwhile that the monitor does not answer.
+  }
+  asking = false;
+  if (waiting.size) ask([]);
+}
+
+// --- the table
+
+// A row whose cells are updated in place, so that it is never rebuilt under a person's hands.
+class Row {
+  constructor(row) {
+    const cell = (name, title) => make("div", "", { role: "cell", class: name, "data-title": title ?? null });
+    this.cells = { name: cell("name"), x: cell("curve-x"), y: cell("curve-y"), z: cell("curve-z"), change: cell("number", "change"), over: cell("number", "of U"), u: cell("number", "U"), band: cell("number", "band"), good: cell("number", "last good window"), reference: cell("reference", "reference") };
+    this.kind = make("span");
+    this.cells.name.append(this.kind, make("a", row.sensor, { href: `#${placeOf(row)}` }));
+    this.element = make("div", Object.values(this.cells), { role: "row", class: "row" });
+    this.update(row);
+    const known = trends.get(full(row));
+    if (known) this.history(known.told);
+  }
+
+  update(row) {
+    if (this.shown !== row.kind) this.kind.replaceChildren(chip(row.kind));
+    this.shown = row.kind;
+    put(this.cells.u, finite(row.u_pct) ? `± ${two(row.u_pct)} %` : "");
+    put(this.cells.band, band(row.band_hz));
+    put(this.cells.good, row.kind === "silent" ? `not heard for ${ago(row.heard_utc_ns)}` : ago(row.last_good_utc_ns));
+    this.name = row.reference;
+    if (!this.known) put(this.cells.reference, row.reference);
+  }
+
+  history(told) {
+    this.known = told;
+    if (!told.t_utc_ns) return;
+    const from = now() - 366 * DAY_NS;
+    AXES.forEach((axis, i) => this.cells[axis].replaceChildren(spark(`S${axis}${axis} over a year`, [{ t: told.t_utc_ns, v: told.main_pct[i], tone: axis }], [from, now(), -SCALE_PCT, SCALE_PCT])));
+    const over = MAIN.map((i, k) => ({ ...told.changes[i], pct: told.main_pct[k].at(-1) })).filter((c) => finite(c.change) && c.U > 0);
+    const most = over.sort((a, b) => Math.abs(b.change) / b.U - Math.abs(a.change) / a.U)[0];
+    const U = most && Math.abs((most.pct * most.U) / most.change);
+    put(this.cells.change, most ? `${signed(most.pct, finite(U) && U > 0 ? U : 0.01)} %` : "");
+    put(this.cells.over, most ? `${(Math.abs(most.change) / most.U).toFixed(1)} U` : "");
+    const since = told.certificate_utc_ns;
+    this.cells.reference.replaceChildren(text(this.name), ...(since ? [make("span", [", certificate in use since ", day(since)], { class: "hint" })] : []));
+  }
+}
+
+const seen = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) {
+    const group = groups.get(target.dataset.of);
+    if (!group) continue;
+    group.seen = isIntersecting;
+    fill(group);
+  }
+}, { rootMargin: "400px" });
+
+const inHand = (element) => element.contains(document.activeElement) || (!getSelection().isCollapsed && element.contains(getSelection().anchorNode));
+
+// Draws the rows of a group that is seen, and forgets those of one that is far away.
+function fill(group) {
+  if (group.seen && group.open) {
+    group.built ??= new Map();
+    const names = new Set(group.rows.map(full));
+    for (const [name, row] of group.built) if (!names.has(name)) { row.element.remove(); group.built.delete(name); }
+    group.rows.forEach((row, i) => {
+      const name = full(row), built = group.built.get(name) ?? new Row(row), there = group.body.children[i];
+      if (group.built.has(name)) built.update(row);
+      group.built.set(name, built);
+      if (there !== built.element) group.body.insertBefore(built.element, there ?? null);
+    });
+    ask(group.rows);
+  } else if (group.built && !inHand(group.body)) {
+    group.body.replaceChildren();
+    group.built = null;
+  }
+}
+
+function made(name) {
+  const button = make("button", [make("span", "", { class: "group-name" }), make("span", "", { class: "hint" })], { type: "button", "aria-expanded": "true" });
+  const head = make("div", make("div", button, { role: "cell" }), { role: "row", class: "group-head" }), body = make("div", "", { role: "presentation", class: "rows" });
+  const group = { element: make("div", [head, body], { role: "rowgroup", class: "group" }), button, body, rows: [], built: null, open: true, seen: false };
+  body.dataset.of = name;
+  button.addEventListener("click", () => {
+    group.open = !group.open;
+    button.setAttribute("aria-expanded", String(group.open));
+    size(group);
+    fill(group);
+  });
+  seen.observe(body);
+  return group;
+}
+
+const size = (group) => group.body.style.setProperty("--rows", group.open ? group.rows.length : 0);
+
+function showTable(sensors, gateways, filter) {
+  const wantedRows = Map.groupBy(sensors.filter((row) => wanted(row, filter)), gatewayOf), states = new Map(gateways.map((g) => [gatewayOf(g), g]));
+  for (const [name, group] of groups) if (!wantedRows.has(name) && !inHand(group.element)) { seen.unobserve(group.body); group.element.remove(); groups.delete(name); }
+  let last = null;
+  for (const [name, rows] of wantedRows) {
+    const group = groups.get(name) ?? made(name), many = group.rows.length !== rows.length;
+    group.rows = rows;
+    if (!groups.has(name)) last ? last.after(group.element) : $("groups").prepend(group.element);
+    groups.set(name, group);
+    last = group.element;
+    if (many) size(group);
+    put(group.button.children[0], `${rows[0].site} / ${rows[0].gateway}`);
+    const state = states.get(name);
+    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? state.state || "on the bus" : "not on the bus"}`);
+    if (group.built || group.seen) fill(group);
+  }
+  $("sensors").setAttribute("aria-rowcount", String(sensors.length));
+  put($("none"), wantedRows.size ? "" : "No sensor is like this.");
+}
+
+// --- the view
+
+let latest = null, changing = () => undefined;
+const filterOf = () => ({ kind: view().get("kind") ?? "", words: (view().get("filter") ?? "").toLowerCase() });
+
+export function show(told, go) {
+  latest = told;
+  changing = go;
+  const filter = filterOf();
+  if ($("filter").value !== (view().get("filter") ?? "")) $("filter").value = view().get("filter") ?? "";
+  showCounts(told.sensors, filter.kind, go);
+  showCards(told.sensors, told.gateways, filter);
+  showTable(told.sensors, told.gateways, filter);
+  const rows = told.gateways.slice(0, GATEWAYS_MAX).map((g) => [gatewayOf(g), g.alive ? "yes" : "no", g.state, g.sensors, g.version, make("span", g.why, { class: "why" })]), key = JSON.stringify(told.gateways);
+  if ($("gateways").dataset.key !== key && !inHand($("gateways"))) {
+    $("gateways").dataset.key = key;
+    $("gateways").replaceChildren(table("Gateways", ["Gateway", "On the bus", "State", "Sensors", "Version", "Why a person is needed"], rows));
+  }
+}
+
+// A picture of the table: what is filtered, with the numbers that have been seen.
+function picture() {
+  const rows = [...$("groups").querySelectorAll(".row")].map((row) => [...row.children].map((cell) => make("td", cell.textContent)));
+  const heads = [...$("heads").children].map((head) => make("th", head.textContent));
+  saveTable(make("table", [make("tr", heads), ...rows.map((cells) => make("tr", cells))]), "fleet.png");
+}
+
+export function start() {
+  $("filter").addEventListener("input", () => changing({ filter: $("filter").value }));
   $("filters").addEventListener("submit", (event) => event.preventDefault());
-  $("events-png").addEventListener("click", () => saveTable($("event-rows").querySelector("table"), "events.png"));
-  $("fleet-png").addEventListener("click", () => saveTable($("sensors"), "fleet.png"));
+  $("fleet-png").addEventListener("click", picture);
+  $("more-cards").addEventListener("click", () => { shownCards += 20; show(latest, changing); });
+  $("fold").addEventListener("click", () => {
+    const open = [...groups.values()].some((group) => group.open);
+    for (const group of groups.values()) if (group.open === open) group.button.click();
+  });
 }

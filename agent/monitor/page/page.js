@@ -1,11 +1,21 @@
 // Which view is shown, who is logged in, and what changed.
-import { leaveBench, showBench } from "./bench.js";
-import { $, get, make, NeedsLogin, text, view } from "./common.js";
+import * as bench from "./bench.js";
+import { $, full, get, make, NeedsLogin, text, view } from "./common.js";
 import { setUser } from "./commands.js";
-import { showEvents, showFleet, startFleet } from "./fleet.js";
-import { leaveSensor, showSensor, startSensor } from "./sensor.js";
+import * as events from "./events.js";
+import * as fleet from "./fleet.js";
+import { duration, setNow } from "./format.js";
+import * as live from "./live.js";
+import * as plan from "./plan.js";
+import * as sensor from "./sensor.js";
 
-const VIEWS = ["fleet", "sensor", "bench", "events"];
+// Each view is a module, and the element with its name as id. `#view=NAME&...` chooses it; what follows is its own:
+// `#view=live&site=S&gateway=G&sensor=N`. Without a view it is the sensor that the address names, or else the fleet.
+// A module has `show(told, go)`, called whenever the address or the fleet has changed; and where it needs them
+// `start(go)`, called once, and `leave()`, called when another view is shown. `told` is the answer of api/fleet, `go`
+// changes the parameters of the address.
+const VIEWS = { fleet, sensor, plan, live, bench, events };
+const OLD_S = 120; // from which the age of the last result is told
 let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, loading = false, again = false;
 
 function go(given) {
@@ -15,30 +25,33 @@ function go(given) {
   show();
 }
 
+function chosenView(now) {
+  if (Object.hasOwn(VIEWS, now.get("view"))) return now.get("view");
+  return now.has("sensor") ? "sensor" : "fleet";
+}
+
 async function show() {
   if (!told) return;
-  const now = view(), chosen = now.has("sensor") ? "sensor" : VIEWS.includes(now.get("view")) ? now.get("view") : "fleet";
-  for (const id of VIEWS) $(id).hidden = id !== chosen;
-  for (const id of ["fleet", "bench", "events"]) id === chosen ? $(`to-${id}`).setAttribute("aria-current", "page") : $(`to-${id}`).removeAttribute("aria-current");
-  document.title = `fieldcal: ${chosen === "sensor" ? now.get("sensor") : chosen}`;
-  if (chosen !== "sensor") leaveSensor();
-  if (chosen !== "bench") leaveBench();
+  const now = view(), chosen = chosenView(now);
+  for (const id of Object.keys(VIEWS)) {
+    $(id).hidden = id !== chosen;
+    id === chosen ? $(`to-${id}`)?.setAttribute("aria-current", "page") : $(`to-${id}`)?.removeAttribute("aria-current");
+    if (id !== chosen) VIEWS[id].leave?.();
+  }
+  document.title = `fieldcal: ${now.get("sensor") ?? chosen}`;
   try {
-    if (chosen === "sensor") await showSensor(told, go);
-    else if (chosen === "bench") await showBench();
-    else if (chosen === "events") showEvents(await get("api/events"));
-    else if (chosen === "fleet") showFleet(told);
+    await VIEWS[chosen].show(told, go);
   } catch (error) {
     failed(error);
   }
 }
 
 function summary() {
-  const need = told.sensors.filter((row) => row.why).length, gateways = told.gateways.filter((g) => g.why).length, bus = told.bus;
+  const bus = told.bus, need = told.sensors.filter((row) => row.kind !== "sound").length;
   return [
-    `Sensors: ${told.sensors.length}, of which need a person: ${need}`, gateways ? `gateways: ${told.gateways.length}, of which need a person: ${gateways}` : "",
-    bus.verifies ? "signatures are verified" : "signatures are not verified (option --keys)", bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "",
-    bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "", bus.fault, bus.notices,
+    `Sensors: ${told.sensors.length}`, need ? `${need} not in order` : "all in order", bus.verifies ? "signatures verified" : "signatures not verified (option --keys)",
+    bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "", bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "",
+    bus.malformed ? `${bus.malformed} messages were no results` : "", bus.last_result_age_s > OLD_S ? `no result for ${duration(bus.last_result_age_s * 1e9)}` : "", bus.fault, bus.notices,
   ].filter(Boolean).join("; ");
 }
 
@@ -50,11 +63,21 @@ function failed(error) {
   return undefined;
 }
 
+// The rows that have changed, put into those that are known; all of them after a new begin.
+function joined(answer) {
+  setNow(answer.now_utc_ns);
+  const rows = new Map((told?.sensors ?? []).map((row) => [full(row), row])), many = rows.size;
+  for (const row of answer.sensors) rows.set(full(row), row);
+  const sensors = [...rows.values()];
+  if (rows.size !== many) sensors.sort((a, b) => (full(a) < full(b) ? -1 : 1));
+  return { ...answer, sensors };
+}
+
 async function load() {
   if (loading) { again = true; return; }
   loading = true;
   try {
-    told = await get("api/fleet");
+    told = joined(await get(`api/fleet?since=${told?.version ?? 0}`));
     say(summary());
     await show();
   } catch (error) {
@@ -64,20 +87,20 @@ async function load() {
   if (again) { again = false; setTimeout(load, 500); }
 }
 
-const showOpenBench = () => { if (told && !$("bench").hidden) showBench().catch(failed); };
+const showOpenBench = () => { if (told && !$("bench").hidden) bench.show().catch(failed); };
 
 function follow() {
   changes?.close();
   changes = new EventSource("api/changes");
   changes.onmessage = load;
   changes.addEventListener("bench", showOpenBench);
-  changes.onerror = () => { say("the monitor does not answer"); if (changes.readyState === EventSource.CLOSED) setTimeout(begin, 2000); };
+  changes.onerror = () => { say("the monitor does not answer"); changes.close(); setTimeout(begin, 2000); };
 }
 
 function logIn() {
   changes?.close();
   told = null;
-  for (const id of VIEWS) $(id).hidden = true;
+  for (const id of Object.keys(VIEWS)) $(id).hidden = true;
   $("user").replaceChildren();
   $("login").hidden = false;
   say("log in to see the fleet");
@@ -100,6 +123,7 @@ async function begin() {
   if (me.needs_login && !me.user) { logIn(); return; }
   $("login").hidden = true;
   $("user").replaceChildren(...(me.user ? [text(`${me.user} `), make("button", "Log out", { type: "button", click: logOut })] : []));
+  told = null; // the monitor may be another one
   follow();
   await load();
 }
@@ -113,9 +137,8 @@ $("login").addEventListener("submit", async (event) => {
   if (answer.ok) await begin();
 });
 addEventListener("hashchange", show);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { leaveSensor(); leaveBench(); show(); });
-startFleet(go);
-startSensor(go);
-setInterval(() => { if (told && !$("fleet").hidden) showFleet(told); }, 30000); // ages grow without a change
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { sensor.leave(); bench.leave(); show(); });
+for (const one of Object.values(VIEWS)) one.start?.(go);
+setInterval(() => { if (told && !$("fleet").hidden) fleet.show(told, go); }, 30000); // ages grow without a change
 setInterval(showOpenBench, 5000); // so does the silence of a bench
 begin();

@@ -5,7 +5,7 @@ function canvasOf(width, height) {
   const canvas = document.createElement("canvas"), style = getComputedStyle(document.body);
   Object.assign(canvas, { width, height });
   const context = canvas.getContext("2d");
-  context.fillStyle = matchMedia("(prefers-color-scheme: dark)").matches ? "#121212" : "#ffffff";
+  context.fillStyle = style.backgroundColor;
   context.fillRect(0, 0, width, height);
   Object.assign(context, { fillStyle: style.color, strokeStyle: style.color, font: "13px system-ui, sans-serif", textBaseline: "top" });
   return [canvas, context];

@@ -1,57 +1,64 @@
 // Plots by uPlot: quantities over time with bands of k = 2, all with the same range of time; and the response.
 import { make } from "./common.js";
+import { finite, signed } from "./format.js";
 
-const GRID = "#8884";
-export const COLOURS = ["#1a73e8", "#c2500a", "#00805e"];
-const axisOf = () => ({ stroke: getComputedStyle(document.body).color, grid: { stroke: GRID }, ticks: { stroke: GRID } });
+// A named value of page.css.
+export const named = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export const colours = () => ["--x", "--y", "--z"].map(named);
+const axisOf = () => ({ stroke: named("--mute"), grid: { stroke: named("--line"), width: 1 }, ticks: { stroke: named("--line"), width: 1 }, font: "12px system-ui, sans-serif" });
 const width = (box) => box.clientWidth || 320;
 
 export function boxOf(label) {
   return make("div", [], { role: "group", "aria-label": label, class: "plot" });
 }
 
-// Values over time with bands, one plot for each series {label, title, values, u, onsets}; u: standard uncertainties.
+// Plots over time that all show the same range of it. A plot is {title, unit, height, series, marks}; a series {label,
+// values, u, tone}, u: standard uncertainties; a mark {t, text, alarm}.
 export class TimePlots {
-  constructor(container, onRange) {
-    this.container = container;
+  constructor(onRange) {
     this.onRange = onRange;
     this.plots = [];
     this.range = null;
     this.setting = false;
   }
 
-  update(times, series) {
-    const shown = times.length ? series : [];
-    if (this.plots.length !== shown.length) {
-      this.plots = [];
-      this.container.replaceChildren(...shown.map((one) => boxOf(`${one.title} over time with its k = 2 band`)));
-    }
+  // Draws them anew into the boxes; `times` in s of UTC.
+  draw(times, drawn) {
+    for (const plot of this.plots) plot.destroy();
+    this.times = times;
     this.setting = true;
-    shown.forEach((one, i) => {
-      const shift = (k) => one.values.map((v, j) => (v === null || one.u[j] === null ? null : v + k * one.u[j]));
-      const data = [times, shift(0), shift(2), shift(-2)];
-      if (this.plots[i]) this.plots[i].setData(data, !this.range);
-      else this.plots[i] = this.made(one, data, this.container.children[i]);
-      this.plots[i].onsets = one.onsets ?? [];
-      this.plots[i].redraw(false);
-    });
-    this.setting = false;
+    this.plots = drawn.map(([box, one]) => this.made(one, times, box));
     this.setRange(this.range);
   }
 
-  made(one, data, box) {
-    const colour = COLOURS[0], axis = axisOf();
-    return new uPlot({
-      title: one.title, width: width(box), height: 200, cursor: { sync: { key: "time" } }, legend: { live: true },
-      axes: [axis, { ...axis, size: 70 }],
-      series: [{}, { label: one.label, stroke: colour, width: 2, points: { show: data[0].length < 60 } }, ...["+U", "-U"].map((label) => ({ label, stroke: `${colour}88`, points: { show: false } }))],
-      bands: [{ series: [2, 3], fill: `${colour}33` }],
-      hooks: { draw: [drawOnsets], setScale: [(plot, key) => key === "x" && this.zoomed(plot)] },
+  made(one, times, box) {
+    const axis = axisOf(), series = [{}], data = [times], bands = [];
+    for (const { label, values, u, tone } of one.series) {
+      const colour = named(`--${tone}`), at = series.length;
+      series.push({ label, stroke: colour, width: 2, points: { show: times.length < 60, size: 4 }, value: (_, v) => (v === null || v === undefined ? "–" : `${signed(v, one.digit)}${one.unit}`) });
+      data.push(values);
+      if (!u) continue;
+      for (const k of [2, -2]) {
+        series.push({ edge: true, stroke: "transparent", points: { show: false } });
+        data.push(values.map((v, j) => (finite(v) && finite(u[j]) ? v + k * u[j] : null)));
+      }
+      bands.push({ series: [at + 1, at + 2], fill: `${colour}26` });
+    }
+    box.setAttribute("aria-label", `${one.title} over time`);
+    box.replaceChildren();
+    const plot = new uPlot({
+      width: width(box), height: one.height, cursor: { sync: { key: "time" }, y: false }, legend: { live: true },
+      axes: [axis, { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => `${signed(v, 10 * (ticks[1] - ticks[0] || 1))}${one.unit}`) }],
+      series, bands, padding: [12, 12, null, null],
+      scales: { y: { range: (_, low, high) => [Math.min(low, -one.digit), Math.max(high, one.digit)] } },
+      hooks: { draw: [(made) => drawMarks(made, one.marks ?? [])], setScale: [(made, key) => key === "x" && this.zoomed(made)] },
     }, data, box);
+    [...box.querySelectorAll(".u-series")].forEach((label, i) => { label.hidden = Boolean(series[i].edge); });
+    return plot;
   }
 
   zoomed(plot) {
-    const { min, max } = plot.scales.x, [times] = plot.data;
+    const { min, max } = plot.scales.x, times = this.times;
     if (this.setting || min === undefined || times.length === 0) return;
     const all = min <= times[0] && max >= times.at(-1);
     this.setRange(all ? null : [min, max]);
@@ -62,35 +69,46 @@ export class TimePlots {
   setRange(range) {
     this.range = range;
     this.setting = true;
-    for (const plot of this.plots) {
-      const times = plot.data[0];
-      if (times.length) plot.setScale("x", range ? { min: range[0], max: range[1] } : { min: times[0], max: times.at(-1) > times[0] ? times.at(-1) : times[0] + 1 });
-    }
+    const times = this.times ?? [];
+    for (const plot of times.length ? this.plots : []) plot.setScale("x", range ? { min: range[0], max: range[1] } : { min: times[0], max: times.at(-1) > times[0] ? times.at(-1) : times[0] + 1 });
     queueMicrotask(() => { this.setting = false; }); // uPlot tells of a new scale in a microtask
+  }
+
+  // A wider or narrower range, or one that is moved by a part of itself.
+  move(factor, part) {
+    const times = this.times ?? [];
+    if (times.length < 2) return;
+    const [from, to] = this.range ?? [times[0], times.at(-1)], half = ((to - from) / 2) * factor, middle = (from + to) / 2 + part * (to - from);
+    this.setRange(middle - half <= times[0] && middle + half >= times.at(-1) ? null : [middle - half, middle + half]);
+    this.onRange(this.range);
   }
 }
 
-// A dashed line where a drift or a step began.
-function drawOnsets(plot) {
-  const { ctx, bbox } = plot;
+// Dashed lines with their words: where a drift or a step began, a reference was exchanged, the agent began anew.
+function drawMarks(plot, marks) {
+  const { ctx, bbox } = plot, size = 11 * devicePixelRatio;
   ctx.save();
-  ctx.strokeStyle = getComputedStyle(document.documentElement).getPropertyValue("--alarm");
   ctx.setLineDash([6, 4]);
-  ctx.lineWidth = 2;
-  for (const onset of plot.onsets ?? []) {
-    const x = plot.valToPos(onset, "x", true);
-    if (x < bbox.left || x > bbox.left + bbox.width) continue;
+  ctx.lineWidth = devicePixelRatio;
+  ctx.font = `${size}px system-ui, sans-serif`;
+  marks.forEach(({ t, text, alarm }, i) => {
+    const x = plot.valToPos(t, "x", true);
+    if (x < bbox.left || x > bbox.left + bbox.width) return;
+    ctx.strokeStyle = ctx.fillStyle = named(alarm ? "--bad" : "--mute");
     ctx.beginPath();
     ctx.moveTo(x, bbox.top);
     ctx.lineTo(x, bbox.top + bbox.height);
     ctx.stroke();
-  }
+    const right = x + ctx.measureText(text).width + 8 > bbox.left + bbox.width;
+    ctx.textAlign = right ? "right" : "left";
+    ctx.fillText(text, x + (right ? -5 : 5) * devicePixelRatio, bbox.top + size * (1 + (i % 3)));
+  });
   ctx.restore();
 }
 
 // Curves {label, values, u} over one axis of x; `log`: a logarithmic axis of frequency; `time`: x is s of UTC.
-export function curves(box, title, x, series, log, time = false) {
-  const axis = axisOf(), drawn = [{}], data = [x], bands = [];
+export function curves(box, title, x, series, log, time = false, height = 240) {
+  const axis = axisOf(), COLOURS = colours(), drawn = [{}], data = [x], bands = [];
   series.forEach((one, i) => {
     drawn.push({ label: one.label, stroke: COLOURS[i], width: one.u ? 2 : 1, points: { show: x.length < 60 } });
     data.push(one.values);
@@ -102,12 +120,12 @@ export function curves(box, title, x, series, log, time = false) {
     bands.push({ series: [drawn.length - 2, drawn.length - 1], fill: `${COLOURS[i]}22` });
   });
   box.replaceChildren();
-  return new uPlot({ title, width: width(box), height: 240, axes: [axis, { ...axis, size: 70 }], scales: { x: { time, distr: log ? 3 : 1 } }, series: drawn, bands, cursor: { drag: { setScale: !log } } }, data, box);
+  return new uPlot({ title, width: width(box), height, axes: [axis, { ...axis, size: 70 }], scales: { x: { time, distr: log ? 3 : 1 } }, series: drawn, bands, cursor: { drag: { setScale: !log } } }, data, box);
 }
 
 // U after each stop on a logarithmic axis, with what is wanted as dashed lines.
 export function descent(box, taken, wanted) {
-  const axis = axisOf(), x = taken.map((_, i) => i + 1), kinds = [["main", "main_pct"], ["transverse", "transverse_pct"]];
+  const axis = axisOf(), COLOURS = colours(), x = taken.map((_, i) => i + 1), kinds = [["main", "main_pct"], ["transverse", "transverse_pct"]];
   const series = kinds.flatMap(([kind], i) => [
     { label: `U (${kind}), %`, stroke: COLOURS[i], width: 2, points: { show: true } },
     { label: `wanted (${kind})`, stroke: COLOURS[i], dash: [6, 4], points: { show: false } }]);

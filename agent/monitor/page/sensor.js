@@ -1,65 +1,151 @@
-// The view of one sensor: S and Q with U over time, response, drift, windows, devices, history, and its commands.
-import { $, at, clean, get, make, placeOf, table, text, view } from "./common.js";
+// The view of one sensor: what is said of it, S and Q over time, response, what makes U, events, history, commands.
+import { $, clean, full, get, make, placeOf, table, text, view } from "./common.js";
 import { opener, poseForm } from "./commands.js";
 import { drawRows } from "./diagram.js";
+import { ago, AXES, band, day, finite, MAIN, moment, NAMES, plusMinus, rounded, short, symbol, two } from "./format.js";
+import { bars, chip } from "./parts.js";
 import { savePlots } from "./picture.js";
 import { boxOf, curves, TimePlots } from "./plots.js";
+import { steps, told as toldOf } from "./words.js";
 
-const AXES = ["x", "y", "z"];
-const NAMES = [...AXES.flatMap((i) => AXES.map((j) => `S${i}${j}`)), ...AXES.map((i) => `Q${i}`)];
 const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
 const KINDS = ["calibration", "window", "drift", "status", "estimate", "clock"];
+const MARKS_MAX = 40;
+const BUDGET_LEAST = 0.01; // share of a source that is shown by itself
 const value = (c, i) => (i < 9 ? c.sensitivity[Math.floor(i / 3)][i % 3] : c.offset[i - 9]);
-const finite = (v) => typeof v === "number" && Number.isFinite(v);
-const short = (v) => (finite(v) ? Number(v.toPrecision(5)).toString() : "not known");
+const ofAxis = (c, i) => value(c, i < 9 ? 4 * Math.floor(i / 3) : 4 * (i - 9)); // the main sensitivity of an output
 let current = null; // {place, changed, plots}
 
-function onsetsOf(drifts) {
-  const newest = Object.fromEntries(drifts.map((d) => [d.parameter, d]));
-  return NAMES.map((name) => (newest[name] && newest[name].verdict !== "stable" ? [newest[name].onset_utc_ns / 1e9] : []));
-}
-
-function seriesOf(calibrations, drifts) {
-  const unit = clean(calibrations.at(-1)?.output_unit), onsets = onsetsOf(drifts);
-  return NAMES.map((name, i) => ({
-    label: name, title: `${name}, ${unit}${i < 9 ? " per m/s²" : ""}`, onsets: onsets[i],
-    values: calibrations.map((c) => value(c, i)), u: calibrations.map((c) => c.standard_uncertainty[i]),
-  }));
-}
-
-const section = (title, ...content) => make("section", [make("h3", title), ...content.flat()]);
 const csv = (place, what) => make("p", make("a", "CSV", { href: `sensor.csv?${place}&what=${what}` }));
 const newestFirst = (rows) => rows.slice().reverse();
+const fold = (title, ...content) => make("details", [make("summary", make("h3", title)), ...content.flat()], { class: "card pad" });
 
-function responseSection(newest, later) {
-  const bands = newest?.response ?? [];
-  if (!bands.length) return [];
-  const box = boxOf("Response over frequency: main sensitivities against the sensitivity in force, in %");
+// --- plots over time
+
+// A series in % of the main sensitivity of its output since the calibration `from`; of an offset in m/s².
+function seriesOf(calibrations, from, i, tone) {
+  const unit = i < 9 ? 100 : 1, scale = from ? Math.abs(ofAxis(from, i)) : 0, base = from ? value(from, i) : 0;
+  const part = (v) => (finite(v) && scale ? (unit * v) / scale : null);
+  return { label: NAMES[i], tone, values: calibrations.map((c) => (finite(value(c, i)) ? part(value(c, i) - base) : null)), u: calibrations.map((c) => part(c.standard_uncertainty[i])) };
+}
+
+function marksOf(row, trends, whole, statuses) {
+  const marks = [];
+  for (const v of row?.verdicts ?? []) {
+    const change = trends.found?.[v.parameter]?.change, t = (change?.onset_utc_ns ?? v.onset_utc_ns) / 1e9;
+    marks.push({ t, alarm: true, text: `${clean(v.parameter)} ${v.verdict === "stepped" ? "steps" : "begins to drift"}` });
+  }
+  whole.forEach((c, k) => {
+    const before = whole[k - 1];
+    if (before && c.references?.at(-1) !== before.references?.at(-1)) marks.push({ t: c.t_utc_ns / 1e9, text: `reference ${clean(c.references?.at(-1))}` });
+    if (before && c.made_sequence && !before.made_sequence) marks.push({ t: c.t_utc_ns / 1e9, text: "restart" });
+  });
+  for (const s of statuses) {
+    if (/^(estimate \d+ accepted|rolled back|put on hold|released) by /.test(s.reason)) marks.push({ t: s.t_utc_ns / 1e9, text: "operator" });
+    if (s.status === "RECALIBRATING" && s.before !== "RECALIBRATING") marks.push({ t: s.t_utc_ns / 1e9, text: "jump adopted", alarm: true });
+  }
+  return marks.slice(0, MARKS_MAX);
+}
+
+function drawPlots(mine, row, trends, whole, found) {
+  const from = whole.find((c) => c.t_utc_ns >= (trends.accepted_utc_ns ?? 0)) ?? whole[0], times = whole.map((c) => c.t_utc_ns / 1e9), all = NAMES.map((_, i) => i);
+  const marks = marksOf(row, trends, whole, found.status);
+  const plot = (title, which, unit, digit, height) => ({ title, unit, digit, height, marks: height > 200 ? marks : [], series: which.map((i, k) => seriesOf(whole, from, i, AXES[which.length === 3 ? k : Math.floor(i / 3)])) });
+  const transverse = all.filter((i) => i < 9 && !MAIN.includes(i));
+  $("main-title").replaceChildren("Main sensitivities, change since the ", text(trends.accepted ? "accepted" : "first"), " calibration of ", from ? day(from.t_utc_ns) : "");
+  if (!mine.boxes) {
+    mine.boxes = [boxOf(""), boxOf(""), boxOf("")];
+    $("main-plot").replaceChildren(mine.boxes[0]);
+    $("small-plots").replaceChildren(make("div", [make("h3", "Transverse, % of main"), mine.boxes[1]], { class: "card pad" }), make("div", [make("h3", "Offset Q, m/s²"), mine.boxes[2]], { class: "card pad" }), make("div", [make("h3", "Response over frequency"), make("div", "", { id: "response-plot" })], { class: "card pad" }));
+  }
+  if (times.length) mine.plots.draw(times, [[mine.boxes[0], plot("Main sensitivities", MAIN, " %", 0.01, 280)], [mine.boxes[1], plot("Transverse sensitivities", transverse, " %", 0.01, 170)], [mine.boxes[2], plot("Offset", [9, 10, 11], "", 0.001, 170)]]);
+}
+
+function drawResponse(newest) {
+  const bands = newest?.response ?? [], place = $("response-plot");
+  if (!bands.length) { place.replaceChildren(make("p", "The motion has no band that is wide enough to tell it.", { class: "hint" })); return; }
   const middle = bands.map((b) => Math.sqrt(Math.max(b.low_hz, 0.1 * b.high_hz) * b.high_hz));
   const part = (b, i) => [b.sensitivity_re[i][i], b.standard_uncertainty[i][i]].map((v) => (100 * v) / newest.sensitivity[i][i]);
   const series = AXES.map((axis, i) => ({ label: `S${axis}${axis}`, values: bands.map((b) => part(b, i)[0] - 100), u: bands.map((b) => part(b, i)[1]) }));
-  later.push(() => curves(box, "Re S(f) against S in force, %", middle, series, true));
-  const rows = bands.map((b) => [`${short(b.low_hz)} to ${short(b.high_hz)}`, ...AXES.map((_, i) => `${short(b.sensitivity_re[i][i])} ± ${short(2 * b.standard_uncertainty[i][i])}, imaginary ${short(b.sensitivity_im[i][i])}`)]);
-  return section(`Response over frequency; S holds at ${short(newest.reference_frequency_hz)} Hz`, box, table("Response over frequency", ["Hz", "Sxx", "Syy", "Szz"], rows));
+  const box = boxOf("Response over frequency: main sensitivities against the sensitivity in force, in %");
+  place.replaceChildren(box);
+  curves(box, "", middle, series, true, false, 170);
+}
+
+// --- what stands beside the plots
+
+function showMatrix(newest, row, trends) {
+  $("matrix-title").replaceChildren(text(newest ? `S in force, ${clean(newest.output_unit)} per m/s²` : "S in force"));
+  if (!newest) { $("matrix").replaceChildren(make("p", "No calibration is in force.")); return; }
+  const moved = new Set((row?.verdicts ?? []).map((v) => v.parameter));
+  const cell = (i) => {
+    const U = 2 * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "";
+    const known = newest.determined[i] ? [] : [make("small", "by the prior")];
+    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(over ? [make("small", `moved ${over}`)] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
+  };
+  const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
+  const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);
+  const Q = AXES.map((axis, i) => make("td", [plusMinus(newest.offset[i], 2 * newest.standard_uncertainty[9 + i])], { title: `Q${axis}`, class: moved.has(`Q${axis}`) ? "moved" : "" }));
+  const at = [`At ${two(newest.reference_frequency_hz)} Hz`, newest.valid_band_hz?.length === 2 ? `; right within U/3 from ${band(newest.valid_band_hz)}` : "", ". U with k = 2 below each value; “moved”: its change since the accepted calibration over U of that change."];
+  $("matrix").replaceChildren(make("table", [make("caption", "S in force", { class: "hidden" }), make("thead", head), make("tbody", rows)], { class: "matrix" }),
+    make("table", [make("caption", `Offset Q, ${clean(newest.output_unit)}`), make("tbody", make("tr", Q))], { class: "matrix" }), make("p", at, { class: "hint" }));
+}
+
+function showBudget(newest, row, trends) {
+  const sources = Object.entries(trends.budget ?? {}), of = row?.verdicts[0]?.parameter, k = Math.max(0, MAIN.map((i) => NAMES[i]).indexOf(of)), name = NAMES[MAIN[k]];
+  const total = sources.reduce((sum, [, u]) => sum + u[k] ** 2, 0), scale = newest ? Math.abs(value(newest, MAIN[k])) : 0;
+  $("budget-title").replaceChildren("What makes U of ", symbol(name), total > 0 && scale ? ` (${two((200 * Math.sqrt(total)) / scale)} %)` : "");
+  if (!(total > 0)) { $("budget").replaceChildren(make("p", ["The newest result does not say it. On the gateway: ", make("code", `fieldcal show --budget ${newest ? newest.sequence : "NUMBER"}`)], { class: "hint" })); return; }
+  const shares = sources.map(([source, u]) => [source, u[k] ** 2 / total]).sort((a, b) => b[1] - a[1]), small = shares.filter(([, s]) => s < BUDGET_LEAST);
+  const rest = small.length ? [[`${small.length} others`, small.reduce((sum, [, s]) => sum + s, 0)]] : [];
+  $("budget").replaceChildren(bars([...shares.filter(([, s]) => s >= BUDGET_LEAST), ...rest]));
+}
+
+function showDevice(row, newest, clocks, trends) {
+  const clock = clocks.filter((c) => c.role === "sensor").at(-1), ppm = clock && 1e6 * (clock.rate_hz / clock.nominal_rate_hz - 1);
+  const lines = [
+    newest && ["Sensor", newest.identity], clock && ["Rate", `${short(clock.rate_hz)} Hz, clock ${two(ppm)} ppm`], clock && finite(clock.lag_s) && ["Lag", `${plusMinus(1000 * clock.lag_s, 2000 * clock.u_lag_s)} ms`],
+    newest && finite(newest.temperature_low_degc) && ["Temperature", `${two(newest.temperature_low_degc)} to ${two(newest.temperature_high_degc)} °C calibrated, S and Q at ${short(newest.reference_temperature_degc)} °C`],
+    newest && ["References", newest.references.join("; ") || "none"], trends.certificate_utc_ns && ["Certificate", make("span", ["in use since ", day(trends.certificate_utc_ns), ` (${ago(trends.certificate_utc_ns)})`])],
+    row && ["Last good window", `${ago(row.last_good_utc_ns)} ago`], newest && ["Result", newest.signed_by ? `signed with the key ${newest.signed_by}` : "not verified"],
+  ].filter(Boolean);
+  $("device").replaceChildren(make("dl", lines.flatMap(([title, told]) => [make("dt", title), make("dd", told)]), { class: "facts" }));
+}
+
+// Each event once, with how often it was told; numbers that differ make no other event.
+function showEvents(statuses, drifts, estimates) {
+  const told = [...statuses.map((s) => [s.t_utc_ns, s.status, s.reason]), ...drifts.map((d) => [d.t_utc_ns, `${d.parameter} ${d.verdict}`, d.reason]), ...estimates.map((e) => [e.t_utc_ns, "estimate, not in force", e.reason])].sort((a, b) => b[0] - a[0]), once = new Map();
+  for (const [t, what, reason] of told) {
+    const key = `${what} ${String(reason).replace(/[-+]?[0-9][0-9.e+-]*/g, "")}`, same = once.get(key);
+    once.set(key, same ? { ...same, first: t, count: same.count + 1 } : { t, first: t, what, reason, count: 1 });
+  }
+  const often = (e) => (e.count > 1 ? make("span", [`${e.count} times since `, day(e.first)]) : "once");
+  $("sensor-events").replaceChildren(table("Events", ["When", "What", "Reason", "How often"], [...once.values()].map((e) => [moment(e.t), e.what, e.reason, often(e)])));
+}
+
+// --- what is folded below
+
+function responseSection(newest) {
+  const bands = newest?.response ?? [];
+  const rows = bands.map((b) => [band([b.low_hz, b.high_hz]), ...AXES.map((_, i) => `${plusMinus(b.sensitivity_re[i][i], 2 * b.standard_uncertainty[i][i])}, imaginary ${rounded(b.sensitivity_im[i][i], 2 * b.standard_uncertainty[i][i])}`)]);
+  return bands.length ? fold(`Response over frequency; S holds at ${short(newest.reference_frequency_hz)} Hz`, table("Response over frequency", ["Band", "Sxx", "Syy", "Szz"], rows)) : [];
 }
 
 function temperatureSection(last, whole, later) {
   const known = whole.filter((c) => finite(c.reference_temperature_degc));
-  if (!known.length) return section("Temperature", make("p", "The device measures no temperature."));
+  if (!known.length) return [];
   const box = boxOf("Temperature over time: of reference, and the range of the data");
   const keys = [["of reference", "reference_temperature_degc"], ["lowest", "temperature_low_degc"], ["highest", "temperature_high_degc"]];
   later.push(() => curves(box, "Temperature, °C", known.map((c) => c.t_utc_ns / 1e9), keys.map(([label, key]) => ({ label, values: known.map((c) => c[key]) })), false, true));
-  const told = `Q holds at ${short(last.reference_temperature_degc)} °C; data from ${short(last.temperature_low_degc)} to ${short(last.temperature_high_degc)} °C.`;
   const slopes = (last.offset_temperature ?? []).map((row, k) => `Q by temperature, order ${k + 1}: ${row.map(short).join(", ")} ${last.output_unit}/K${k ? `^${k + 1}` : ""}. `);
-  return section("Temperature", make("p", [told, " ", ...slopes]), box);
+  return fold("Temperature", make("p", [`Q holds at ${short(last.reference_temperature_degc)} °C; data from ${short(last.temperature_low_degc)} to ${short(last.temperature_high_degc)} °C. `, ...slopes]), box);
 }
 
 function devicesSection(newest, clocks) {
   const devices = Object.values(Object.fromEntries(clocks.map((c) => [c.device, c])));
-  const rows = devices.map((c) => [c.device, c.role, `${short(c.rate_hz)} of ${short(c.nominal_rate_hz)}`, finite(c.lag_s) ? `${short(1000 * c.lag_s)} ± ${short(2000 * c.u_lag_s)}` : "", short(1000 * c.jitter_s)]);
+  const rows = devices.map((c) => [c.device, c.role, `${short(c.rate_hz)} of ${short(c.nominal_rate_hz)}`, finite(c.lag_s) ? plusMinus(1000 * c.lag_s, 2000 * c.u_lag_s) : "", two(1000 * c.jitter_s)]);
   const shared = (newest?.shared_errors ?? []).map((s) => [s.reference, s.serial_number, s.sensitivity.map(short).join(", "), s.certificate_sha256.slice(0, 16)]);
-  return section("Devices and certificates",
-    make("p", newest ? [`Sensor: ${newest.identity}. References: ${newest.references.join("; ") || "none"}. `, newest.signed_by ? `Signed with the key ${newest.signed_by}.` : "Not verified."] : "No calibration yet."),
+  return fold("Devices and certificates", make("p", newest ? `Sensor: ${newest.identity}. References: ${newest.references.join("; ") || "none"}.` : "No calibration yet."),
     ...(rows.length ? [table("Clocks of the devices", ["Device", "Role", "Rate, Hz", "Lag, ms (U)", "Jitter, ms"], rows)] : []),
     ...(shared.length ? [table("References", ["Reference", "Serial number", "Sensitivity by certificate", "SHA-256 of the certificate"], shared)] : []));
 }
@@ -68,102 +154,85 @@ function spaceSection(newest, later) {
   if (!newest) return [];
   const canvas = make("canvas", [], { role: "img", "aria-label": "Rows of S in space; a row on its axis has no transverse sensitivity", class: "space" });
   later.push(() => drawRows(canvas, newest.sensitivity));
-  return section("Rows of S in space", canvas);
+  return fold("Rows of S in space", canvas);
 }
 
-function inForceSection(place, newest) {
-  if (!newest) return [];
-  const rows = NAMES.map((name, i) => [name, short(value(newest, i)), finite(newest.standard_uncertainty[i]) ? short(2 * newest.standard_uncertainty[i]) : "not known", `${newest.output_unit}${i < 9 ? " per m/s²" : ""}`, newest.determined[i] ? "yes" : "no"]);
-  return section("In force", table("In force", ["Parameter", "Value", "U (k = 2)", "Unit", "Determined by data"], rows), csv(place, "calibration"));
-}
-
-// The advice looks at the peers too, so it comes later than the rest.
+// The advice looks at the peers too, so it is asked for when it is opened.
 function adviceSection(place) {
-  const box = make("div", "is being computed");
-  get(`api/advice?${place}`).then((advice) => box.replaceChildren(adviceTable(advice)), () => box.replaceChildren(text("not known")));
-  return section("When to look again", make("p", "Interval in which a change stays within the limit with 95 %, from the history (control chart, ILAC-G24)."), box, make("p", make("a", "CSV", { href: `advice.csv?${place}` })));
+  const box = make("div", "is being computed"), rows = (advice) => advice.map((a) => [a.subject, a.interval_days === null ? "not yet" : `${two(a.interval_days)} days`, a.due_utc_ns ? day(a.due_utc_ns) : "", a.reason]);
+  const section = fold("When to look again", make("p", "Interval in which a change stays within the limit with 95 %, from the history (control chart, ILAC-G24)."), box, make("p", make("a", "CSV", { href: `advice.csv?${place}` })));
+  section.addEventListener("toggle", () => get(`api/advice?${place}`).then((advice) => box.replaceChildren(table("When to look again", ["Of", "Interval", "Due", "Reasoning"], rows(advice))), () => box.replaceChildren(text("not known"))), { once: true });
+  return section;
 }
 
-function adviceTable(advice) {
-  const rows = advice.map((a) => [a.subject, a.interval_days === null ? "not yet" : `${short(a.interval_days)} days`, a.due_utc_ns ? at(a.due_utc_ns) : "", a.reason]);
-  return table("When to look again", ["Of", "Interval", "Due (UTC)", "Reasoning"], rows);
-}
-
-// Results before those that are kept in full: counts of each hour.
-function hoursSection(place, hours) {
-  const rows = newestFirst(hours).map((r) => [at(r.t_utc_ns), r.status, r.calibrations, r.estimates, r.windows_used, r.windows_refused, r.clocks]);
-  return section("Summarised hours", table("Summarised hours", ["Until (UTC)", "Status", "Calibrations", "Estimates", "Windows used", "Windows refused", "Clock reports"], rows), make("p", make("a", "CSV", { href: `hours.csv?${place}` })));
-}
-
-function sections(place, told, whole, hours, later) {
+function sections(place, found, whole, hours, later) {
   const gateway = `${place.get("site")}/${place.get("gateway")}`, sensor = place.get("sensor");
-  const { calibration, window, drift, status, estimate, clock } = told, newest = calibration.at(-1);
+  const { calibration, window, drift, status, estimate, clock } = found, newest = calibration.at(-1);
   const order = (verb, sequence) => ({ gateway, sensor, verb, arguments: { sequence } });
   const numbers = (w) => Object.entries(w.numbers).map(([name, v]) => `${name} ${short(v)}`).join(", ");
   return [
-    inForceSection(place, newest),
-    section("Drift", table("Drift", ["UTC", "Parameter", "Verdict", "Since", "Reason"], newestFirst(drift).map((r) => [at(r.t_utc_ns), r.parameter, r.verdict, r.verdict === "stable" ? "" : at(r.onset_utc_ns), r.reason])), csv(place, "drift")),
-    adviceSection(place),
-    section("Estimates that are not in force", table("Estimates", ["UTC", "Number", "Why not in force", "Accept"], newestFirst(estimate).map((r) => [at(r.t_utc_ns), r.sequence, r.reason, opener(`Accept ${r.sequence}`, order("accept", r.sequence))])), csv(place, "estimate")),
-    section("History of calibrations", table("Calibrations", ["UTC", "Number", "Windows", "Method", "Roll back"], newestFirst(calibration).map((r, i) => [at(r.t_utc_ns), r.sequence, r.windows, r.method, i === 0 ? "in force" : opener(`Roll back to ${r.sequence}`, order("rollback", r.sequence))]))),
-    responseSection(newest, later),
-    spaceSection(newest, later),
-    temperatureSection(newest, whole, later),
-    section("Status", table("Status", ["UTC", "Status", "Reason"], newestFirst(status).map((r) => [at(r.t_utc_ns), r.status, r.reason])), csv(place, "status")),
-    section("Windows", table("Windows", ["UTC", "Position", "Verdict", "Reason", "Numbers"], newestFirst(window).map((r) => [at(r.t_utc_ns), r.position, r.used ? "used" : "refused", r.reason, numbers(r)])), csv(place, "window")),
-    hoursSection(place, hours),
+    fold("History of calibrations", table("Calibrations", ["When", "Number", "Windows", "Method", "Roll back"], newestFirst(calibration).map((r, i) => [moment(r.t_utc_ns), r.sequence, r.windows, r.method, i === 0 ? "in force" : opener(`Roll back to ${r.sequence}`, order("rollback", r.sequence))])), csv(place, "calibration")),
+    fold("Estimates that are not in force", table("Estimates", ["When", "Number", "Why not in force", "Accept"], newestFirst(estimate).map((r) => [moment(r.t_utc_ns), r.sequence, r.reason, opener(`Accept ${r.sequence}`, order("accept", r.sequence))])), csv(place, "estimate")),
+    adviceSection(place), responseSection(newest), temperatureSection(newest, whole, later), spaceSection(newest, later),
+    fold("Windows", table("Windows", ["When", "Position", "Verdict", "Reason", "Numbers"], newestFirst(window).map((r) => [moment(r.t_utc_ns), r.position, r.used ? "used" : "refused", r.reason, numbers(r)])), csv(place, "window")),
+    fold("Drift verdicts and status", csv(place, "drift"), csv(place, "status"), table("Drift", ["When", "Parameter", "Verdict", "Since", "Reason"], newestFirst(drift).map((r) => [moment(r.t_utc_ns), r.parameter, r.verdict, r.verdict === "stable" ? "" : moment(r.onset_utc_ns), r.reason]))),
+    fold("Summarised hours", table("Summarised hours", ["Until", "Status", "Calibrations", "Estimates", "Windows used", "Windows refused", "Clock reports"], newestFirst(hours).map((r) => [moment(r.t_utc_ns), r.status, r.calibrations, r.estimates, r.windows_used, r.windows_refused, r.clocks])), make("p", make("a", "CSV", { href: `hours.csv?${place}` }))),
     devicesSection(newest, clock),
   ].flat();
 }
 
-function liveSection(place) {
-  const box = make("div"), told = make("p", [], { role: "status" });
-  let source = null;
-  const button = make("button", "Show the live waveform", { type: "button" });
-  const stop = () => { source?.close(); source = null; button.textContent = "Show the live waveform"; };
-  button.addEventListener("click", () => {
-    if (source) return stop();
-    button.textContent = "Stop";
-    told.replaceChildren(text("waiting for a block; the gateway sends none unless its channel publishes acceleration"));
-    source = new EventSource(`api/live?${place}`);
-    source.onmessage = (message) => {
-      const block = JSON.parse(message.data), plot = box.firstChild ?? box.appendChild(boxOf("Corrected acceleration, newest block"));
-      told.replaceChildren(text(`corrected acceleration by calibration ${block.calibration_sequence || "of the prior"}, ${short(block.rate_hz)} Hz`));
-      curves(plot, "a, m/s²", block.acceleration.map((_, k) => k / block.rate_hz), AXES.map((label, i) => ({ label, values: block.acceleration.map((row) => row[i]) })), false);
-    };
-    return undefined;
-  });
-  return [section("Live", make("p", button), told, box), stop];
-}
+// --- the view
 
 function begin(place) {
   const gateway = `${place.get("site")}/${place.get("gateway")}`, sensor = place.get("sensor");
-  const hold = (given) => ({ gateway, sensor, verb: "hold", arguments: given }), [live, stop] = liveSection(place);
-  $("name").replaceChildren(text(`${gateway}/${sensor}`));
-  $("commands").replaceChildren(live, section("Commands", make("p", [opener("Hold", hold({})), " ", opener("Release", hold({ release: true }))]), poseForm(gateway, sensor)));
-  $("plots").replaceChildren();
-  $("details").replaceChildren();
-  return stop;
+  const hold = (given) => ({ gateway, sensor, verb: "hold", arguments: given });
+  $("crumbs").replaceChildren(make("a", "Fleet", { href: "#" }), text(` / ${place.get("site")} / ${place.get("gateway")}`));
+  $("actions").replaceChildren(make("a", "Live signal", { href: `#view=live&${place}`, class: "button" }), opener("Hold", hold({})), opener("Release", hold({ release: true })));
+  $("commands").replaceChildren(fold("State a position", poseForm(gateway, sensor)));
+  for (const id of ["main-plot", "small-plots", "details", "matrix", "budget", "device", "sensor-events"]) $(id).replaceChildren();
+}
+
+function showHead(row, place, trends) {
+  const name = place.get("sensor");
+  $("name").replaceChildren(text(name), ...(row ? [text(" "), chip(row.kind)] : []));
+  const { say, more } = row ? toldOf(row, trends) : { say: "The monitor has no results of this sensor.", more: [] };
+  $("state").replaceChildren(make("span", say));
+  $("beside-state").replaceChildren(make("span", more));
+  $("sensor-steps").replaceChildren(...(row ? steps(row, trends) : []), ...(row && row.kind === "sound" ? [make("p", "Nothing: it is in order.")] : []));
+}
+
+// The folded parts that a person has opened stay open.
+function refold(made) {
+  const open = new Set([...$("details").querySelectorAll("details[open] > summary")].map((summary) => summary.textContent));
+  for (const part of made) if (open.has(part.querySelector("summary")?.textContent)) part.open = true;
+  $("details").replaceChildren(...made);
 }
 
 // Shows the sensor of the address; asks for its results only when its row has changed. `go` changes the address.
-export async function showSensor(told, go) {
+export async function show(told, go) {
   const now = view(), place = new URLSearchParams(["site", "gateway", "sensor"].map((n) => [n, now.get(n) ?? ""]));
   const row = told.sensors.find((r) => placeOf(r).toString() === place.toString());
-  $("state").replaceChildren(text(row ? row.why || row.status : "the monitor has no results of this sensor"));
   if (current?.place !== place.toString()) {
-    leaveSensor();
-    current = { place: place.toString(), changed: null, stop: begin(place), plots: new TimePlots($("plots"), (range) => go({ from: range?.[0].toFixed(0), to: range?.[1].toFixed(0), days: "" })) };
+    leave();
+    begin(place);
+    showHead(row, place, {});
+    current = { place: place.toString(), changed: null, plots: new TimePlots((range) => go({ from: range?.[0].toFixed(0), to: range?.[1].toFixed(0), days: "" })) };
   }
-  const mine = current;
-  if (mine.changed !== (row?.changed ?? 0)) {
+  const mine = current, inHand = $("details").contains(document.activeElement) && document.activeElement.tagName !== "SUMMARY";
+  if (mine.changed !== (row?.changed ?? 0) && !inHand) {
     mine.changed = row?.changed ?? 0;
-    const [whole, hours, ...results] = await Promise.all([get(`api/spread?${place}`), get(`api/hours?${place}&limit=${NEWEST}`), ...KINDS.map((what) => get(`api/history?${place}&what=${what}&limit=${NEWEST}`))]);
+    const name = row ? full(row) : "", [told2, whole, hours, ...results] = await Promise.all([get(`api/trends?${new URLSearchParams({ of: name })}`), get(`api/spread?${place}`), get(`api/hours?${place}&limit=${NEWEST}`), ...KINDS.map((what) => get(`api/history?${place}&what=${what}&limit=${NEWEST}`))]);
     if (current !== mine) return;
-    const found = Object.fromEntries(KINDS.map((what, i) => [what, results[i]])), later = [];
+    const trends = told2[name] ?? {}, found = Object.fromEntries(KINDS.map((what, i) => [what, results[i]])), later = [], newest = found.calibration.at(-1);
     mine.last = (whole.at(-1)?.t_utc_ns ?? 0) / 1e9;
-    mine.plots.update(whole.map((c) => c.t_utc_ns / 1e9), seriesOf(whole, found.drift));
-    $("details").replaceChildren(...sections(place, found, whole, hours, later));
+    showHead(row, place, trends);
+    drawPlots(mine, row, trends, whole, found);
+    if (whole.length) drawResponse(newest);
+    showMatrix(newest, row, trends);
+    showBudget(newest, row, trends);
+    showDevice(row, newest, found.clock, trends);
+    showEvents(found.status, found.drift, found.estimate);
+    refold(sections(place, found, whole, hours, later));
     for (const draw of later) draw();
   }
   const days = Number(now.get("days")), from = Number(now.get("from")), to = Number(now.get("to")), zoom = from > 0 && to > from;
@@ -172,12 +241,19 @@ export async function showSensor(told, go) {
   if (`${range}` !== `${mine.plots.range}`) mine.plots.setRange(range);
 }
 
-export function leaveSensor() {
-  current?.stop();
+export function leave() {
   current = null;
 }
 
-export function startSensor(go) {
+const KEYS = { "+": [0.5, 0], "=": [0.5, 0], "-": [2, 0], ArrowLeft: [1, -0.25], ArrowRight: [1, 0.25], 0: [1e9, 0] };
+
+export function start(go) {
   $("span").addEventListener("input", () => $("span").value !== "zoom" && go({ days: $("span").value, from: "", to: "" }));
   $("sensor-png").addEventListener("click", () => savePlots([...$("sensor").querySelectorAll(".plot")], $("name").textContent, "sensor.png"));
+  $("main-plot").tabIndex = 0;
+  $("main-plot").addEventListener("keydown", (event) => {
+    if (!KEYS[event.key] || event.ctrlKey || event.metaKey) return;
+    event.preventDefault();
+    current?.plots.move(...KEYS[event.key]);
+  });
 }

@@ -1,0 +1,155 @@
+"""What the page shows of a sensor's history: its main sensitivities thinned, their change with U, and its verdicts."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from agent.monitor.database import DAY_NS, Database
+from agent.monitor.fleet import MAIN, Fleet, Place
+from agent.monitor.onset import since
+from calib.model import PARAMETERS
+
+THINNED = 60  # points of a small plot
+POINTS = 400  # of the history to which a change is fitted
+YEAR_DAYS = 366
+KEPT_FOR_S, KEPT_MAX = 60.0, 2000  # for so long, and of so many sensors, what was found is used again
+STATUSES = 200  # changes of status that are looked at
+# Source of a budget that results of one reference share (calib.estimate.quantities).
+OF_REFERENCE = "reference sensitivity"
+_ACCEPTED = re.compile(r"(?:estimate [0-9]+ accepted|rolled back) by ")  # as agent.core.gate says it
+
+
+class Trends:
+    """What is found of the sensors of a database. May be used by several threads."""
+
+    def __init__(self, database: Database, fleet: Fleet) -> None:
+        self._database, self._fleet = database, fleet
+        self._kept: dict[tuple[Place, str], tuple[float, dict[str, Any]]] = {}
+
+    def of(self, place: Place) -> dict[str, Any]:
+        """`t_utc_ns` (n) and `main_pct` (3, n): a year of the main sensitivities as changes since the calibration of
+        `accepted_utc_ns`; `changes`: of each parameter its change and U of that; `budget`: what makes u of the main
+        sensitivities (3), by source; `found`: of each verdict what the
+        history tells; `held_utc_ns`: since when the status is what it is; `beside`: Fleet.beside.
+
+        {} where no calibration is known.
+        """
+        verdicts = self._fleet.verdicts(place)
+        key = place, str([(v["parameter"], v["verdict"]) for v in verdicts])
+        kept_s, found = self._kept.get(key, (-KEPT_FOR_S, {}))
+        if time.monotonic() - kept_s >= KEPT_FOR_S:
+            found = self._found(place, verdicts)
+            if len(self._kept) >= KEPT_MAX:
+                self._kept.pop(next(iter(self._kept)), None)
+            self._kept[key] = time.monotonic(), found
+        return found
+
+    def _found(self, place: Place, verdicts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        history = self._database.spread(*place, "calibration", POINTS if verdicts else THINNED)
+        if not history:
+            return {}
+        statuses = self._database.history(*place, "status", STATUSES)
+        accepted = max((s["t_utc_ns"] for s in statuses if _ACCEPTED.match(s["reason"])), default=0)
+        from_then = [c for c in history if c["t_utc_ns"] >= accepted] or history[-1:]
+        first, last = from_then[0], history[-1]
+        ends = self._with_budget(place, first), self._with_budget(place, last)
+        year = [c for c in history if c["t_utc_ns"] > last["t_utc_ns"] - YEAR_DAYS * DAY_NS]
+        shown = [year[k] for k in _thinned(len(year))]
+        return {
+            "t_utc_ns": [c["t_utc_ns"] for c in shown],
+            "main_pct": [[_pct(first, c, i) for c in shown] for i in MAIN],
+            "accepted": accepted > 0,
+            "accepted_utc_ns": first["t_utc_ns"],
+            "changes": [change_of(*ends, i) for i in range(len(PARAMETERS))],
+            "budget": {source: [u[i] for i in MAIN] for source, u in ends[1].get("budget", {}).items()},
+            "held_utc_ns": _lasting(statuses),
+            "certificate_utc_ns": _certificate_since(history),
+            "found": {v["parameter"]: _trend(v, from_then) for v in verdicts},
+            "beside": self._fleet.beside(place),
+        }
+
+    def _with_budget(self, place: Place, calibration: dict[str, Any]) -> dict[str, Any]:
+        """The calibration with the budget of its day, which the first one of the day has."""
+        day = self._database.first_of_day(*place, "calibration", calibration["t_utc_ns"])
+        return calibration if day is None else calibration | {"budget": day.get("budget", {})}
+
+
+def change_of(first: Mapping[str, Any], last: Mapping[str, Any], i: int) -> dict[str, float | None]:
+    """Of parameter `i` from one calibration to another: `change` and its `U` (k = 2), in its unit.
+
+    What both owe to the sensitivity of the same references cancels, as far as their budgets tell it; the rest counts as
+    if it were independent, which is at most too much: the later one also knows the windows of the earlier one.
+    """
+    a, b = value_of(first, i), value_of(last, i)
+    one, other = first["standard_uncertainty"][i], last["standard_uncertainty"][i]
+    if a is None or b is None or one is None or other is None:
+        return {"change": None, "U": None}
+    same = first["references"] == last["references"] and _certificates(first) == _certificates(last)
+    shared = [c.get("budget", {}).get(OF_REFERENCE, [0.0] * 12)[i] or 0.0 for c in (first, last)]
+    common = min(2.0 * shared[0] * shared[1], one**2 + other**2) if same and first is not last else 0.0
+    return {"change": b - a, "U": 2.0 * math.sqrt(one**2 + other**2 - common)}
+
+
+def _thinned(count: int) -> list[int]:
+    """At most THINNED positions, evenly, the last among them."""
+    return sorted({round(k * (count - 1) / max(THINNED - 1, 1)) for k in range(THINNED)}) if count else []
+
+
+def value_of(calibration: Mapping[str, Any], i: int) -> float | None:
+    """Parameter `i` of PARAMETERS; None where it is not known."""
+    value: float | None = calibration["sensitivity"][i // 3][i % 3] if i < 9 else calibration["offset"][i - 9]
+    return value
+
+
+def _pct(first: Mapping[str, Any], last: Mapping[str, Any], i: int) -> float | None:
+    a, b = value_of(first, i), value_of(last, i)
+    return 100.0 * (b - a) / abs(a) if a and b is not None else None
+
+
+def _certificates(calibration: Mapping[str, Any]) -> list[str]:
+    return [shared["certificate_sha256"] for shared in calibration.get("shared_errors", [])]
+
+
+def _certificate_since(history: Sequence[Mapping[str, Any]]) -> int | None:
+    """Since when the certificates of the newest calibration are in use, as far as the history goes back."""
+    own = _certificates(history[-1])
+    same = [c["t_utc_ns"] for c in history if _certificates(c) == own]
+    return same[0] if any(own) else None
+
+
+def _lasting(statuses: Sequence[Mapping[str, Any]]) -> int | None:
+    """Since when the status is what it is."""
+    lasting = None
+    for told in reversed(statuses):
+        if told["status"] != statuses[-1]["status"]:
+            break
+        lasting = told["t_utc_ns"]
+    return lasting
+
+
+def _trend(verdict: Mapping[str, Any], history: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The parameter of a verdict over time, and the `change` that its history shows; None where it shows none."""
+    i = PARAMETERS.index(verdict["parameter"])
+    known = [(c["t_utc_ns"], v, c["standard_uncertainty"][i]) for c in history if (v := value_of(c, i)) is not None]
+    t_utc_ns = [t for t, _, _ in known]
+    days, values = np.array(t_utc_ns, dtype=float) / DAY_NS, np.array([v for _, v, _ in known])
+    rising = np.append(True, np.diff(days) > 0) if len(days) else np.zeros(0, dtype=bool)
+    change = since(days[rising], values[rising], verdict["verdict"])
+    thin = _thinned(len(known))
+    return {
+        "t_utc_ns": [known[k][0] for k in thin],
+        "values": [known[k][1] for k in thin],
+        "u": [known[k][2] for k in thin],
+        "scale": value_of(history[-1], 4 * (i // 3 if i < 9 else i - 9)),  # the main sensitivity of its output
+        "change": change
+        and {
+            "onset_utc_ns": round(change.day * DAY_NS), "u_onset_days": change.u_day, "size": change.size,
+            "u_size": change.u_size, "rate": change.rate, "u_rate": change.u_rate,
+        },
+    }  # fmt: skip

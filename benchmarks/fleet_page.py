@@ -1,0 +1,111 @@
+"""How quick the fleet page is, in Chromium, with simulated sensors: `python -m benchmarks.fleet_page`.
+
+Router, monitor and browser run on this machine; the monitor is a process of its own and has answered before. Each run
+opens a new browser context: time from navigation to the first cards and rows painted, bytes until then and 2 s later
+(as they come over the wire), time from a result on the bus to the page, tasks above 50 ms while the table is scrolled,
+and layout shifts that no person's input caused. The median of the runs counts; `--write` puts it into docs/fleet.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from agent.fleet.simulated import SimulatedFleet
+from agent.fleet.simulated_sensor import WRONG_FROM
+from benchmarks.page import machine, write_part
+from tests.unit.browser import chromium
+from tests.unit.monitor_site import Monitor
+from tests.unit.zenoh_site import Site, wait_for
+
+GATEWAYS, SENSORS, SEED = 100, 10, 7
+DOCS = Path(__file__).resolve().parents[1] / "docs" / "fleet.md"
+DAY_NS = 86_400_000_000_000
+SCROLLS, SCROLL_PX, APART_MS = 60, 240, 50
+SETTLES_MS = 2000
+WATCH = """
+window.seen = { painted: 0, shifts: 0, tasks: [] };
+new PerformanceObserver((l) => l.getEntries().forEach((e) => { if (!e.hadRecentInput) seen.shifts += e.value; }))
+  .observe({ type: 'layout-shift', buffered: true });
+new PerformanceObserver((l) => l.getEntries().forEach((e) => seen.tasks.push([e.startTime, e.duration])))
+  .observe({ type: 'longtask', buffered: true });
+const there = () => document.querySelector('#cards .card') && document.querySelector('#groups .row');
+const look = () => (there() ? requestAnimationFrame(() => { seen.painted ||= performance.now(); })
+  : requestAnimationFrame(look));
+requestAnimationFrame(look);
+"""
+
+
+def run(browser: Any, monitor: Monitor, change: Any) -> dict[str, float]:
+    """One run. `change` puts a result on the bus by which one sensor more is held."""
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    context.add_init_script(WATCH)
+    page = context.new_page()
+    received: list[float] = []
+    network = context.new_cdp_session(page)
+    network.send("Network.enable")
+    network.on("Network.loadingFinished", lambda told: received.append(told["encodedDataLength"]))
+    page.goto(f"{monitor.url}/")
+    page.wait_for_function("() => seen.painted > 0")
+    first = sum(received)
+    page.wait_for_timeout(SETTLES_MS)
+    held = "() => [...document.querySelectorAll('#counts button')].map((b) => b.textContent).join()"
+    before = page.evaluate(held)
+    begun = time.monotonic()
+    change()
+    page.wait_for_function(f"before => ({held})() !== before", arg=before)
+    seen_s = time.monotonic() - begun
+    from_ms = page.evaluate("() => performance.now()")
+    page.mouse.move(700, 600)
+    for _ in range(SCROLLS):
+        page.mouse.wheel(0, SCROLL_PX)
+        page.wait_for_timeout(APART_MS)
+    told = page.evaluate("() => seen")
+    tasks = [duration for begin, duration in told["tasks"] if begin >= from_ms]
+    found = {
+        "painted after, s": told["painted"] / 1e3, "bytes until then, kB": first / 1e3,
+        "bytes 2 s later, kB": sum(received) / 1e3, "a change is seen after, s": seen_s,
+        "longest task while scrolling, ms": max(tasks, default=0.0), "layout shifts": told["shifts"],
+        "rows drawn after scrolling": page.locator("#groups .row").count(),
+    }  # fmt: skip
+    context.close()
+    return found
+
+
+def main() -> None:
+    """Measure, and print or write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--write", action="store_true", help="put the table into docs/fleet.md")
+    args = parser.parse_args()
+    site = Site()
+    with tempfile.TemporaryDirectory() as directory, chromium() as browser:
+        monitor = Monitor(site.endpoint, Path(directory) / "monitor")
+        with SimulatedFleet(GATEWAYS, SENSORS, SEED, [site.endpoint], Path(directory) / "fleet") as fleet:
+            for k in range(WRONG_FROM):
+                fleet.step(time.time_ns() - (WRONG_FROM - k) * 60 * DAY_NS)
+                wait_for(lambda: len(monitor.sensors()) == GATEWAYS * SENSORS, 120.0)
+            for gateway in fleet.gateways:  # drifts and what is silent, so that there are cards
+                if gateway.behaviour in ("drifting", "hostile"):
+                    for k in range(3):
+                        gateway.step(time.time_ns() - (3 - k) * DAY_NS)
+            wrong = [gateway for gateway in fleet.gateways if gateway.behaviour == "wrong"][: args.runs]
+            runs = [run(browser, monitor, lambda g=gateway: g.step(time.time_ns())) for gateway in wrong]
+        monitor.stop()
+    site.kill()
+    lines = [f"{GATEWAYS * SENSORS} sensors of {GATEWAYS} gateways, {len(runs)} runs; {machine()}.", "",
+             "| | median | runs |", "| --- | --- | --- |"]  # fmt: skip
+    for name in runs[0]:
+        values = [each[name] for each in runs]
+        lines.append(f"| {name} | {statistics.median(values):.3g} | {', '.join(f'{v:.3g}' for v in values)} |")
+    print("\n".join(lines))
+    if args.write:
+        write_part("fleet page", "\n".join(lines), DOCS)
+
+
+if __name__ == "__main__":
+    main()

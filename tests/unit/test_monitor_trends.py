@@ -1,0 +1,177 @@
+"""What the page says of a sensor: its kind, since when it drifts and how much, and the U of a change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import pytest
+
+from agent.core.events import DriftReport
+from agent.delivery.keys import Address
+from agent.delivery.received import Received
+from agent.monitor.database import DAY_NS, Database
+from agent.monitor.engines import Sqlite
+from agent.monitor.fleet import Fleet
+from agent.monitor.onset import since
+from agent.monitor.trends import Trends, change_of
+from tests.unit.results import calibration, status
+
+PLACE = ("site", "gw", "mems")
+NOW_NS = 1_700_000_000_000_000_000
+SECOND_NS = 1_000_000_000
+
+
+def fields_of(result: Any, **more: Any) -> dict[str, Any]:
+    found: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(result))
+    return found | more
+
+
+def verdict(**more: Any) -> dict[str, Any]:
+    made = DriftReport(run_id="r", sequence=9, sensor="mems", t_utc_ns=NOW_NS, parameter="Sxx", verdict="drifting",
+                       change=100.0, u_change=5.0, rate=1.0, u_rate=0.1, onset_utc_ns=NOW_NS - 100 * DAY_NS,
+                       statistic=20.0, threshold=15.0, false_alarms_a_year=0.1, reason="r")  # fmt: skip
+    return fields_of(made, **more)
+
+
+@pytest.mark.parametrize("shape", ["drifting", "stepped"])
+@pytest.mark.parametrize("correlation", [0.0, 0.6])
+def test_the_interval_of_an_onset_has_it(shape: Literal["drifting", "stepped"], correlation: float) -> None:
+    """Of 200 histories of a year, U of onset, size and rate has the truth in at least 90 %, and is not generous."""
+    random, inside, u_days = np.random.default_rng(3), [], []
+    for _ in range(200):
+        count = int(random.integers(40, 300))
+        days, white = np.sort(random.uniform(0.0, 365.0, count)), random.normal(size=count)
+        noise = white.copy()
+        for k in range(1, count):
+            noise[k] = correlation * noise[k - 1] + white[k] * np.sqrt(1.0 - correlation**2)
+        onset, size = random.uniform(60.0, 300.0), random.choice([-1.0, 1.0]) * random.uniform(5.0, 20.0)
+        reach = days[-1] - onset if shape == "drifting" else 1.0
+        bent = np.maximum(days - onset, 0.0) / reach if shape == "drifting" else (days >= onset).astype(float)
+        found = since(days, noise + size * bent, shape)
+        if found is None:
+            continue
+        rate = size / reach if shape == "drifting" else 0.0
+        inside.append([abs(found.day - onset) <= 2 * found.u_day, abs(found.size - size) <= 2 * found.u_size,
+                       abs(found.rate - rate) <= 2 * found.u_rate])  # fmt: skip
+        u_days.append(found.u_day)
+    assert len(inside) > 195
+    assert np.min(np.mean(inside, axis=0)) >= 0.9
+    assert np.median(u_days) < (15.0 if shape == "drifting" else 3.0)
+
+
+def test_a_sound_history_shows_no_change() -> None:
+    random, days = np.random.default_rng(4), np.arange(100.0)
+    found = [since(days, random.normal(size=100), shape) for _ in range(100) for shape in ("drifting", "stepped")]
+    assert sum(each is not None for each in found) <= 4
+    assert since(days[:7], days[:7], "drifting") is None  # too few
+    assert since(days, np.ones(100), "drifting") is None
+
+
+def test_the_error_of_the_one_reference_cancels_in_a_change() -> None:
+    shared = [{"certificate_sha256": "a"}]
+    budget = {"reference sensitivity": [5.9] + [0.0] * 11, "type A": [1.0] * 12}
+    first = fields_of(calibration(1), references=["B12"], shared_errors=shared, budget=budget)
+    last = fields_of(calibration(2, sxx=26164.0), references=["B12"], shared_errors=shared, budget=budget)
+    assert change_of(first, last, 0) == {"change": 10.0, "U": pytest.approx(2 * np.sqrt(2 * (36 - 5.9**2)))}
+    other = last | {"shared_errors": [{"certificate_sha256": "b"}]}  # another certificate, so another error
+    assert change_of(first, other, 0)["U"] == pytest.approx(2 * np.sqrt(72))
+    assert change_of(first, last | {"budget": {}}, 0)["U"] == pytest.approx(2 * np.sqrt(72))
+
+
+class Clock:
+    """The present of a fleet."""
+
+    def __init__(self) -> None:
+        self.ns = NOW_NS
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+def kind(fleet: Fleet) -> str:
+    (row,) = fleet.rows()
+    return str(row["kind"])
+
+
+def test_colours_come_from_verdicts_and_hearing_alone() -> None:
+    now = Clock()
+    fleet = Fleet(now)
+    fleet.set_alive("site", "gw", True)
+    fleet.take(*PLACE, "calibration", fields_of(calibration(1)))
+    fleet.take(*PLACE, "status", fields_of(status(2)))
+    assert kind(fleet) == "sound"
+    fleet.take(*PLACE, "calibration", fields_of(calibration(3, sxx=30000.0)))  # however large a change is
+    assert kind(fleet) == "sound"
+    fleet.take(*PLACE, "status", fields_of(status(4, "HELD")))
+    assert kind(fleet) == "held"
+    fleet.take(*PLACE, "drift", verdict())
+    assert kind(fleet) == "drifting"
+    fleet.set_alive("site", "gw", False)
+    assert kind(fleet) == "silent"  # VALID or not: nobody knows
+    fleet.set_alive("site", "gw", True)
+    fleet.take(*PLACE, "drift", verdict(verdict="stable"))
+    fleet.take(*PLACE, "status", fields_of(status(5, "INVALID")))
+    assert kind(fleet) == "no data"
+
+
+def test_a_sensor_that_misses_three_intervals_is_not_heard() -> None:
+    now = Clock()
+    fleet = Fleet(now)
+    fleet.set_alive("site", "gw", True)
+    for number in range(4):
+        now.ns += 200 * SECOND_NS
+        fleet.take(*PLACE, "status", fields_of(status(number + 1)))
+    heard, version = now.ns, fleet.version
+    now.ns += 599 * SECOND_NS
+    fleet.look()
+    assert (kind(fleet), fleet.version) == ("sound", version)
+    now.ns += 2 * SECOND_NS
+    fleet.look()
+    assert kind(fleet) == "silent"
+    (row,) = fleet.rows(version)  # the page is told of it
+    assert row["heard_utc_ns"] == heard
+    fleet.take(*PLACE, "status", fields_of(status(9)))
+    assert kind(fleet) == "sound"
+
+
+def test_rows_that_have_not_changed_are_not_sent_again_and_events_are_told_once() -> None:
+    fleet = Fleet()
+    for name in ("a", "b"):
+        fleet.take("site", "gw", name, "status", fields_of(status(1), sensor=name))
+    version = fleet.version
+    fleet.take("site", "gw", "b", "drift", verdict(sensor="b"))
+    fleet.take("site", "gw", "b", "drift", verdict(sensor="b", reason="r"))
+    assert [row["sensor"] for row in fleet.rows(version)] == ["b"]
+    assert [(event["sensor"], event["count"]) for event in fleet.events()] == [("b", 2), ("b", 1), ("a", 1)]
+
+
+def test_what_a_history_tells_of_a_drift(tmp_path: Path) -> None:
+    """A year, each fifth day a calibration; Sxx rises from day 200 on, after an operator accepted that of day 100."""
+    fleet, database = Fleet(), Database(Sqlite(tmp_path / "monitor.sqlite"), full_days=1000)
+    begin, random = NOW_NS - 365 * DAY_NS, np.random.default_rng(5)
+
+    def take(what: str, number: int, t_utc_ns: int, fields: dict[str, Any]) -> None:
+        fields |= {"t_utc_ns": t_utc_ns, "sequence": number}
+        database.add([Received("", Address(*PLACE, what), number, fields, None)])
+        fleet.take(*PLACE, what, fields)
+
+    for k in range(74):
+        rise = 2.615 * max(0, 5 * k - 200) + random.normal()  # 0.01 % a day
+        take("calibration", 10 * k + 1, begin + 5 * k * DAY_NS, fields_of(calibration(1, sxx=26154.0 + rise)))
+        if k == 20:
+            accepted = status(1, reason="estimate 7 accepted by anna")
+            take("status", 10 * k + 2, begin + 5 * k * DAY_NS - 1, fields_of(accepted))
+    take("drift", 999, NOW_NS, verdict())
+    found = Trends(database, fleet).of(PLACE)
+    database.close()
+    assert (found["accepted"], found["accepted_utc_ns"]) == (True, begin + 100 * DAY_NS)
+    assert len(found["t_utc_ns"]) == 60
+    assert found["main_pct"][0][-1] == pytest.approx(1.65, abs=0.05)
+    change = found["found"]["Sxx"]["change"]
+    assert abs(change["onset_utc_ns"] / DAY_NS - begin / DAY_NS - 200) < 2 * change["u_onset_days"] < 5
+    assert abs(change["rate"] - 2.615) < 2 * change["u_rate"]
+    assert abs(change["size"] - 2.615 * 165) < 3 * change["u_size"]
+    assert found["found"]["Sxx"]["scale"] == pytest.approx(26154 + 431, abs=5)
