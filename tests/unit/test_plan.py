@@ -5,25 +5,17 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
-from hashlib import sha256
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 pytest.importorskip("argon2", reason="the extra monitor is not installed")
-from starlette.requests import Request
 
-from agent.monitor.database import Database
-from agent.monitor.engines import open_engine
-from agent.monitor.login import Access
 from agent.monitor.pictures import Picture, PictureError, picture_of
-from agent.monitor.plan import LARGEST_PICTURE, Plans, Position
+from agent.monitor.plan import LARGEST_PICTURE
 from agent.monitor.users import set_user
 from tests.unit.monitor_site import Answer, Served
-from tests.unit.postgres import postgres
 from tests.unit.zenoh_site import Site
 
 PASSWORD = "correct horse battery staple"
@@ -150,26 +142,3 @@ def test_hostile_requests_are_refused(served: Served) -> None:
     ):
         assert served.ask("/api/plan/position", "POST", told, anna).status == 400
     assert served.ask("/api/plan", headers=anna).json == before
-
-
-@pytest.mark.parametrize("kind", ["sqlite", "postgres"])
-def test_the_plan_is_kept_by_both_databases(kind: str, tmp_path: Path) -> None:
-    with ExitStack() as opened:
-        url = opened.enter_context(postgres()) if kind == "postgres" else None
-
-        def plans() -> Plans:
-            engine = opened.enter_context(closing(open_engine(tmp_path, url)))
-            Database(engine)
-            return Plans(engine, Access(None))
-
-        first = plans()
-        for side in (8, 9):
-            first.keep("image/png", png(side, side))
-        for at in ((0.1, 0.2), (0.123456789, 0.75)):
-            first.place(Position(NAMES, at))
-        first.place(Position("site/gw/other", (0.0, 1.0)))
-        first.place(Position("site/gw/other", None))
-        request = Request({"type": "http"})
-        told = json.loads(bytes(plans().told(request).body))
-        assert told == {"picture": sha256(png(9, 9)).hexdigest(), "positions": {NAMES: [0.123456789, 0.75]}}
-        assert bytes(plans().picture(request).body) == png(9, 9)
