@@ -52,7 +52,7 @@ function decades(_, low, high) {
 
 // One plot for each title; it is made anew where its curves or its scales change.
 function plot(id, title, x, curves, more = {}) {
-  const { log, bands, unit } = more, box = $(id), key = `${title} ${box.clientWidth}`, ink = getComputedStyle(document.body).color, axis = { stroke: ink, grid: { stroke: "#8883" }, ticks: { stroke: "#8883" } }, marks = log ? { filter: (_, splits) => splits.map((v) => (isDecade(v) ? v : null)), grid: { show: false }, ticks: { show: false } } : {};
+  const { log, bands, unit } = more, box = $(id), ink = getComputedStyle(document.body).color, key = `${title} ${box.clientWidth} ${ink}`, axis = { stroke: ink, grid: { stroke: "#8883" }, ticks: { stroke: "#8883" } }, marks = log ? { filter: (_, splits) => splits.map((v) => (isDecade(v) ? v : null)), grid: { show: false }, ticks: { show: false } } : {};
   if (plots.get(id)?.key === key) { plots.get(id).plot.setData([x, ...curves.map((one) => one.values)]); return; }
   plots.get(id)?.plot.destroy();
   const distr = log ? 3 : 1, series = curves.map((one) => ({ label: one.label, stroke: one.edge ? "transparent" : one.stroke, width: 1, points: { show: false }, value: (_, v) => (v === null || v === undefined ? "–" : few(v)) }));
