@@ -27,7 +27,7 @@ fleet: $(VENV)/development  ## router, fleet page and a simulated fleet of 40 se
 	@directory=$$(mktemp -d); touch $$directory/known.keys; \
 	$(BIN)/fieldcal monitor --router --data-dir $$directory --keys $$directory/known.keys & monitor=$$!; \
 	trap 'kill $$monitor 2>/dev/null; wait $$monitor; rm -r $$directory' EXIT; trap : INT TERM; \
-	$(BIN)/fieldcal simulate --fleet 10 --sensors 4 --every 1 --age 365 --speed 86400 --keys $$directory/known.keys
+	$(BIN)/fieldcal simulate --fleet 10 --sensors 4 --every 4 --age 365 --speed 86400 --keys $$directory/known.keys
 
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
 once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }

@@ -12,15 +12,17 @@ from pathlib import Path
 
 import msgspec
 
+from agent.core.events import Result
 from agent.delivery.keys import Address
 from agent.delivery.received import Received
-from agent.fleet.simulated_sensor import SimulatedSensor
+from agent.fleet.simulated_sensor import SimulatedSensor, Story
 from agent.monitor.database import DAY_NS, Database
 from agent.monitor.engines import Engine, open_engine
 from agent.monitor.summaries import FULL_DAYS
 
 MINUTE_NS = 60_000_000_000
 SENSORS, MORE_DAYS = 2, 7
+DRAWN = 60  # rounds that are drawn; later ones repeat their numbers
 START = 20_000 * DAY_NS
 
 
@@ -31,17 +33,17 @@ def main() -> None:
         engine = open_engine(Path(directory), url)
         now_ns, sequence = START, 0
         database = Database(engine, now_ns=lambda: now_ns)
-        sensors = [SimulatedSensor(f"s{k}", "sound", [7, k]) for k in range(SENSORS)]
+        sensors = [drawn(f"s{k}", [7, k]) for k in range(SENSORS)]
         sizes, adding_s, steps, published, results = [], 0.0, [], 0, 0
         for day in range(FULL_DAYS + 1 + MORE_DAYS):
             for minute in range(1440):
                 now_ns = START + day * DAY_NS + minute * MINUTE_NS
-                for sensor in sensors:
-                    for result in sensor.results(day * 1440 + minute, now_ns, sequence + 1):
-                        sequence = result.sequence
-                        data = msgspec.json.encode(result)
+                for rounds in sensors:
+                    for result in rounds[(day * 1440 + minute) % DRAWN]:
+                        sequence += 1
+                        data = msgspec.json.encode(msgspec.structs.replace(result, sequence=sequence, t_utc_ns=now_ns))
                         published, results = published + len(data), results + 1
-                        address = Address("site", "gateway", sensor.name, result.what)
+                        address = Address("site", "gateway", result.sensor, result.what)
                         received = Received("", address, sequence, msgspec.json.decode(data), None)
                         begun = time.perf_counter()
                         database.add([received])
@@ -59,6 +61,13 @@ def main() -> None:
         )
         print(f"{1e6 * adding_s / results:.0f} us a result; a step of the summaries {1e3 * max(steps):.0f} ms at most")
         database.close()
+
+
+def drawn(name: str, seed: list[int]) -> list[list[Result]]:
+    """The results of DRAWN rounds of a sound sensor, a minute apart, without those of its begin."""
+    sensor = SimulatedSensor(Story(name, "sound", seed), name)
+    rounds = [sensor.results(k, START + k * MINUTE_NS, 1) for k in range(DRAWN + 1)]
+    return rounds[1:]
 
 
 def used_bytes(engine: Engine, url: str | None) -> int:

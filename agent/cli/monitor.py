@@ -15,12 +15,12 @@ from typing import Any
 import click
 
 from agent.cli.tls_options import tls_files, tls_options
-from agent.commanding.arguments import VERBS
 from agent.config.key_file import KeyFileError, read_private_key
 from agent.config.known_keys import read_known_keys
 from agent.config.reading import ConfigError
 from agent.delivery.router import DEFAULT_ENDPOINT, open_router, router_running
 from agent.delivery.session import EndpointError
+from agent.monitor.rights import RIGHTS
 from agent.terminal.text import say
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -44,8 +44,9 @@ _OPTIONS: list[Callable[[Callable[..., Any]], Callable[..., Any]]] = [
                  help="File of users: the page then needs a login."),
     click.option("--add-user", metavar="NAME", help="Add a user to the file --users, or replace one, and end. Asks for "
                  "the password, or reads it from the standard input."),
-    click.option("--verb", "verbs", multiple=True, type=click.Choice(VERBS),
-                 help="With --add-user: a command that the page forwards for this user; may be given several times."),
+    click.option("--verb", "verbs", multiple=True, type=click.Choice(RIGHTS),
+                 help="With --add-user: a command that the page forwards for this user, or `plan`: the user may change "
+                 "the plan; may be given several times."),
     click.option("--config", "config_file", type=_FILE, metavar="F",
                  help="Plan of the structure, and who gets notices (TOML)."),
     click.option("--https-certificate", type=_FILE, metavar="F",

@@ -71,17 +71,17 @@ def simulate(
     --preset plain --csv DIR   sensor.csv, reference.csv, poses.csv and truth.json for `fieldcal calibrate`
     --preset plain             sensor and reference, each on its own port, until Ctrl-C
     --play FILE                a recording on a port, at its own speed, to its end
-    --fleet N                  N gateways on the bus, some of which drift, fall silent, are wrong or hostile
+    --fleet N                  N gateways on the bus, with sensors that drift, step, die or lean, and silent gateways
 
     Nothing is sent until a reader opens the port; the first sample is sent then.
     """
     if fleet["fleet"] is not None:
         if any(value is not None for value in (preset, directory, play, rate_hz, axes, link)) or sequence or loop:
-            raise click.UsageError("--fleet goes with --connect, --sensors, --every, --speed, --age, --keys, --seed "
-                                   "and --duration only")  # fmt: skip
+            raise click.UsageError("--fleet goes with --connect, --sensors, --every, --speed, --age, --keys, "
+                                   "--truth, --seed and --duration only")  # fmt: skip
         return serve_fleet(seed=seed, duration_s=duration_s, **fleet)
     if any(name in _given() for name in fleet):
-        raise click.UsageError("--connect, --sensors, --every, --speed, --age and --keys need --fleet")
+        raise click.UsageError("--connect, --sensors, --every, --speed, --age, --keys and --truth need --fleet")
     if (preset is None) == (play is None):
         raise click.UsageError("give --preset, --play or --fleet")
     if preset is not None and (rate_hz or axes or sequence or loop):

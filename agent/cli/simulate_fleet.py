@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import signal
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from agent.terminal.text import say
+
+if TYPE_CHECKING:
+    from multiprocessing.synchronize import Event
 
 FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; docs/fleet.md has what was measured
 ROUTER_S = 30.0  # s to wait for a router
@@ -27,6 +30,8 @@ def fleet_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         click.option("--keys", type=click.Path(dir_okay=False, path_type=Path), metavar="F",
                      help="Fleet: add the gateways' public keys to this list of known keys."),
+        click.option("--truth", type=click.Path(dir_okay=False, path_type=Path), metavar="F",
+                     help="Fleet: write what is true of each sensor into this file (JSON), after each round."),
         click.option("--age", "age_days", type=click.FloatRange(0, 3650), default=0.0, show_default=True,
                      metavar="DAYS", help="Fleet: how long ago the first results were made."),
         click.option("--speed", type=click.FloatRange(1, 1e6), default=1.0, show_default=True,
@@ -44,7 +49,7 @@ def fleet_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def serve_fleet(
     *, fleet: int, connect: str | None, sensors: int, every_s: float, speed: float, age_days: float,
-    keys: Path | None, seed: int, duration_s: float | None,
+    keys: Path | None, truth: Path | None, seed: int, duration_s: float | None,
 ) -> int:  # fmt: skip
     """Act as `fleet` gateways, whose results have the time that runs `speed` times faster from `age_days` ago.
 
@@ -57,9 +62,9 @@ def serve_fleet(
     from agent.delivery.router import DEFAULT_ENDPOINT
     from agent.delivery.session import EndpointError
     from agent.fleet.simulated import ODD
-    from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses
+    from agent.fleet.simulated_processes import GATEWAYS_EACH, SPAWN, FleetProcesses
 
-    endpoint, stop = connect or DEFAULT_ENDPOINT, threading.Event()
+    endpoint, stop = connect or DEFAULT_ENDPOINT, SPAWN.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     try:
@@ -67,7 +72,7 @@ def serve_fleet(
             say(f"fieldcal simulate: {fault}", err=True)
             return 1
         with TemporaryDirectory(prefix="fieldcal-fleet-") as directory:
-            with FleetProcesses(fleet, sensors, seed, [endpoint], Path(directory)) as simulated:
+            with FleetProcesses(fleet, sensors, seed, [endpoint], Path(directory), stop) as simulated:
                 if simulated.unconnected:
                     say(f"fieldcal simulate: {simulated.unconnected} gateways found no router yet", err=True)
                 if keys is not None:
@@ -78,21 +83,35 @@ def serve_fleet(
                     names = simulated.names_of(behaviour)
                     more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
                     say(f"{behaviour}: {', '.join(names[:NAMES_SHOWN]) or 'none'}{more}")
-                results = _run(simulated.step, stop, every_s, speed, age_days, duration_s)
+
+                def step(t_utc_ns: int) -> int:
+                    made = simulated.step(t_utc_ns)
+                    if truth is not None:
+                        _write_truth(truth, {"seed": seed, "t_utc_ns": t_utc_ns, "gateways": simulated.truth()})
+                    return made
+
+                results = _run(step, stop, every_s, speed, age_days, duration_s)
             say(f"{results} results sent")
     except BrokenProcessPool:
         say(
             "fieldcal simulate: a process of the fleet ended: there is too little memory for so many gateways", err=True
         )
         return 1
-    except (EndpointError, KeyFileError) as error:
+    except (EndpointError, KeyFileError, OSError) as error:
         say(f"fieldcal simulate: {error}", err=True)
         return 2
     return 0
 
 
+def _write_truth(path: Path, truth: dict[str, Any]) -> None:
+    """Replace the file at once, so that a reader never has half of it. Raises OSError."""
+    new = path.with_name(f"{path.name}.new")
+    new.write_text(json.dumps(truth))
+    new.replace(path)
+
+
 def _run(
-    step: Callable[[int], int], stop: threading.Event, every_s: float, speed: float, age_days: float,
+    step: Callable[[int], int], stop: Event, every_s: float, speed: float, age_days: float,
     duration_s: float | None,
 ) -> int:  # fmt: skip
     """Step until it is to stop; returns the number of results."""
@@ -118,7 +137,7 @@ def _files_fault(gateways: int) -> str:
     return ""
 
 
-def _router_fault(endpoint: str, stop: threading.Event) -> str:
+def _router_fault(endpoint: str, stop: Event) -> str:
     """Wait for the router; why there is none, "" if there is one. Raises EndpointError."""
     from agent.delivery.router import router_running
 

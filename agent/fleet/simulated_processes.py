@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, suppress
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,7 +22,10 @@ from agent.fleet.workers import begin
 GATEWAYS_EACH = 100
 NICE = 10  # gateways are other machines: simulated ones leave the processor to a router and a monitor on this one
 
+SPAWN = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
+
 _part: SimulatedFleet  # in a process of the fleet: its gateways
+_stop: Event  # and whether they are to stop
 Value = TypeVar("Value")
 
 
@@ -41,16 +45,21 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
     Raises EndpointError, StoreError; the methods raise BrokenProcessPool where a process has ended.
     """
 
-    def __init__(self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path) -> None:
+    def __init__(
+        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path, stop: Event | None = None
+    ) -> None:
+        """`stop` is an event of `SPAWN`: once it is set, what is going on ends soon."""
         session_config("client", connect=connect)  # raises EndpointError here rather than in another process
         parts = -(-count // GATEWAYS_EACH)
         self.gateways: list[Named] = []
         self.unconnected = 0
         self._parts: list[ProcessPoolExecutor] = []
-        spawn = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
+        stop = stop or SPAWN.Event()
         with ExitStack() as opened:
             for part in range(parts):
-                process = opened.enter_context(ProcessPoolExecutor(1, mp_context=spawn, initializer=_begin))
+                process = opened.enter_context(
+                    ProcessPoolExecutor(1, mp_context=SPAWN, initializer=_begin, initargs=(stop,))
+                )
                 numbers = range(part, count, parts)
                 gateways, unconnected = process.submit(
                     _open, count, sensors, seed, connect, data_dir, numbers).result()  # fmt: skip
@@ -67,6 +76,10 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
     def last_sequence(self) -> dict[str, int]:
         """The number of the last result of each gateway, by its name."""
         return {name: last for part in self._each(_last_sequence) for name, last in part.items()}
+
+    def truth(self) -> list[dict[str, Any]]:
+        """What is true of each gateway and its sensors now, by the names of the gateways."""
+        return sorted((gateway for part in self._each(_truth) for gateway in part), key=lambda told: told["gateway"])
 
     def pids(self) -> list[int]:
         """Of its processes."""
@@ -92,15 +105,19 @@ def _leave(process: ProcessPoolExecutor) -> None:
         process.submit(_close).result()
 
 
-def _begin() -> None:
+def _begin(stop: Event) -> None:
+    global _stop
+    _stop = stop
     Ending().status = 0
     begin()
     os.nice(NICE)
 
 
-def _open(*made: Any) -> tuple[list[Named], int]:
+def _open(
+    count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path, numbers: Sequence[int]
+) -> tuple[list[Named], int]:
     global _part
-    _part = SimulatedFleet(*made)
+    _part = SimulatedFleet(count, sensors, seed, connect, data_dir, numbers, _stop)
     return [Named(g.name, g.source, g.behaviour, g.public_key) for g in _part.gateways], _part.unconnected
 
 
@@ -110,6 +127,10 @@ def _step(t_utc_ns: int, within_s: float) -> int:
 
 def _last_sequence() -> dict[str, int]:
     return {gateway.name: gateway.last_sequence for gateway in _part.gateways}
+
+
+def _truth() -> list[dict[str, Any]]:
+    return [gateway.truth() for gateway in _part.gateways]
 
 
 def _close() -> None:

@@ -1,103 +1,178 @@
-"""Results of a simulated sensor, as a pipeline would give them: S and Q with U, windows, drift verdicts, status.
+"""What happens to a simulated sensor, round by round, and the results that the agent makes of it.
 
-The numbers are drawn, so nothing is calibrated here; kinds, fields and sizes are those of real results.
+A round is one window. All that is odd begins in the round of BEGINS, so that rounds may be a second apart or ten days.
 """
 
 from __future__ import annotations
 
+import re
+import threading
+from collections.abc import Sequence
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
-from agent.core.events import (
-    CalibrationUpdate,
-    DriftReport,
-    Result,
-    StatusChange,
-    WindowReport,
-)
+from agent.core.events import CalibrationUpdate, Estimate, Result, StatusChange
+from agent.fleet.simulated_channel import GRAVITY_MPS2, NOISE_MPS2, NOMINAL, SimulatedChannel, Truth, identity_with
+from calib.model import Array
 
-Behaviour = Literal["sound", "drifting", "silent", "wrong", "hostile"]
-Status = Literal["VALID", "HELD", "INVALID"]
-NOMINAL = 26154.0  # counts per m/s2, as an ADXL355 in its range of 2 g
-U_MAIN, U_TRANSVERSE = 5e-4, 1e-3  # standard uncertainties, relative to NOMINAL
-U_OFFSET = 130.0  # counts, 5 mm/s2
-DRIFT_IN_U = 0.2  # change of Sxx in each round, in units of U
-TELLS_IN_U = 1.0  # change at which a drift is told
-WRONG_FROM = 3  # round from which a wrong sensor's windows contradict its calibration, and a silent one is silent
-THRESHOLD = 32.9  # of the window's test statistic, as refused windows state it
-TEMPERATURE_DEGC = 20.0
+Behaviour = Literal[
+    "sound", "drifting", "stepped", "held", "leaning", "dying", "silent", "cloned", "hostile"
+]  # fmt: skip
+# The first round in which it is so. Of a gateway: the round in which it stops (silent), or its twin begins (cloned).
+BEGINS: dict[Behaviour, int] = {
+    "sound": 0, "drifting": 3, "stepped": 4, "held": 5, "leaning": 5, "dying": 3, "hostile": 3,
+    "silent": 4, "cloned": 4,
+}  # fmt: skip
+VARIANTS = 5  # of each behaviour and name: what differs between two sensors is drawn so many times
+DRIFT_A_ROUND = 2e-3  # of one main sensitivity
+STEP, STEP_TO_BE_HELD = 0.03, 0.09  # of one main sensitivity; a gateway puts at most 5 % in force by itself
+LEAN_DEG = 6.0  # of the mount with the sensor and its reference
+NOISE_GROWS, NOISY_ROUNDS, DEAD_ROUNDS = 3.0, 3, 1  # of a dying sensor: its noise, then one output, then all
+NO_ANSWER = "[Errno 121] Remote I/O error"  # what Linux says of an I2C device that does not answer
+WALK, WALK_MPS2 = 1e-4, 1e-3  # of sensitivities, and of offsets, over a day; they go with the square root of time
+DAY_NS = 86_400e9
+RUN_ID = "simulated"
+NUMBER = re.compile(r"(?<=--sequence )\d+")  # of an estimate, in the words for an operator
+
+
+class Story:
+    """A sensor to which something happens. The rounds are asked for in their order; the newest one may be asked again.
+
+    `seed`: two stories of the same name, behaviour, seed and times give the same results.
+    """
+
+    def __init__(self, name: str, behaviour: Behaviour, seed: Sequence[int]) -> None:
+        self.name, self.behaviour = name, behaviour
+        self._seed = list(seed)
+        self._random = np.random.default_rng([*seed, 0])
+        self._axis = int(self._random.integers(3))  # of the main sensitivity, or of the output, that changes
+        self._sign = 1.0 if self._random.random() < 0.5 else -1.0
+        main, other = 0.01 * self._random.normal(size=3), 0.005 * self._random.normal(size=(3, 3))
+        self._sensitivity = np.eye(3) + np.where(np.eye(3) > 0, np.diag(main), other)
+        self._offset_mps2 = 0.1 * self._random.normal(size=3)
+        self._channel: SimulatedChannel | None = None
+        self._rounds, self._t_utc_ns = 0, 0
+        self._newest: list[Result] = []
+        self._last = 0  # number of the last result
+        self._since_utc_ns: int | None = None
+        self._mutex = threading.Lock()
+
+    def results(self, number: int, t_utc_ns: int) -> list[Result]:
+        """The results of round `number` (from 0), at about this time, numbered from 1 on in the whole story.
+
+        Raises ValueError where this round is not the next one, nor the newest.
+        """
+        with self._mutex:
+            if number == self._rounds:
+                self._newest = self._numbered(self._next(number, t_utc_ns))
+                self._rounds, self._t_utc_ns = number + 1, t_utc_ns
+            if number != self._rounds - 1:
+                raise ValueError(f"round {number} was asked for, but round {self._rounds} is the next one")
+            return self._newest
+
+    def told(self) -> dict[str, Any]:
+        """What is true in the newest round; `sensitivity` and `offset` in counts, `change_pct` of `parameter`."""
+        number = max(self._rounds - 1, 0)
+        truth, begun = self.truth(number), self.behaviour != "sound" and number >= BEGINS[self.behaviour]
+        return {
+            "behaviour": self.behaviour, "begun": begun, "since_utc_ns": self._since_utc_ns,
+            "parameter": self._parameter if begun else "", "change_pct": 100.0 * self._change(number),
+            "lean_deg": LEAN_DEG if begun and self.behaviour == "leaning" else 0.0,
+            "sensitivity": truth.sensitivity.tolist(), "offset": truth.offset.tolist(),
+        }  # fmt: skip
+
+    def truth(self, number: int) -> Truth:
+        """What is true in a round; of the newest one, as sensitivity and offset have wandered until then."""
+        since, gravity, noise, dead = number - BEGINS[self.behaviour], GRAVITY_MPS2, NOISE_MPS2, None
+        sensitivity = self._sensitivity.copy()
+        sensitivity[self._axis] *= 1.0 + self._change(number)
+        if self.behaviour == "leaning" and since >= 0:
+            gravity = _leaned(gravity, np.deg2rad(LEAN_DEG), self._axis)
+        if self.behaviour == "dying" and since >= 0:
+            noise *= NOISE_GROWS ** min(since + 1, NOISY_ROUNDS)
+            dead = self._axis if since >= NOISY_ROUNDS else None
+        return Truth(NOMINAL * sensitivity, NOMINAL * self._offset_mps2, gravity, noise, dead)
+
+    @property
+    def _parameter(self) -> str:
+        return f"S{'xyz'[self._axis] * 2}" if self.behaviour in ("drifting", "stepped", "held") else ""
+
+    def _change(self, number: int) -> float:
+        """By how much the main sensitivity, and with it the row of S, has changed, relative."""
+        since = number - BEGINS[self.behaviour] + 1
+        if since <= 0:
+            return 0.0
+        size = {"drifting": DRIFT_A_ROUND * since, "stepped": STEP, "held": STEP_TO_BE_HELD}.get(self.behaviour, 0.0)
+        return self._sign * size
+
+    def _next(self, number: int, t_utc_ns: int) -> list[Result]:
+        found: list[Result] = []
+        if self._channel is None:
+            self._channel = SimulatedChannel(self.name, [*self._seed, 1], t_utc_ns)
+            found = self._channel.opened(t_utc_ns)
+        else:
+            self._wander((t_utc_ns - self._t_utc_ns) / DAY_NS)
+        since = number - BEGINS[self.behaviour]
+        if self.behaviour != "sound" and since == 0:
+            self._since_utc_ns = t_utc_ns
+        if self.behaviour == "hostile" and since >= 0:
+            return [_hostile(self.name, t_utc_ns)] if since == 0 else []
+        if self.behaviour == "dying" and since >= NOISY_ROUNDS + DEAD_ROUNDS:
+            return self._channel.lost(t_utc_ns, NO_ANSWER) if since == NOISY_ROUNDS + DEAD_ROUNDS else []
+        return [*found, *self._channel.window(self.truth(number), t_utc_ns)]
+
+    def _numbered(self, results: Sequence[Result]) -> list[Result]:
+        assert self._channel is not None  # it was opened in the first round
+        numbered = self._channel.number(results, self._last + 1, RUN_ID)
+        self._last += len(numbered)
+        return numbered
+
+    def _wander(self, days: float) -> None:
+        size = np.sqrt(max(days, 0.0))
+        self._sensitivity = self._sensitivity + WALK * size * np.diag(self._random.normal(size=3))
+        self._offset_mps2 = self._offset_mps2 + WALK_MPS2 * size * self._random.normal(size=3)
 
 
 class SimulatedSensor:
-    """One sensor. `seed`: two sensors of the same seed and behaviour give the same results."""
+    """A story under a serial number and with numbers of its own; several sensors may share one."""
 
-    def __init__(self, name: str, behaviour: Behaviour, seed: list[int]) -> None:
-        self.name, self.behaviour = name, behaviour
-        self._random = np.random.default_rng(seed)
-        main, other = 0.01 * self._random.normal(size=3), 0.005 * self._random.normal(size=(3, 3))
-        self._S = NOMINAL * (np.eye(3) + np.where(np.eye(3) > 0, np.diag(main), other))
-        self._Q = NOMINAL * 0.1 * self._random.normal(size=3)
-        self._status: Status | Literal[""] = ""
-        self._begun_utc_ns = 0
+    def __init__(self, story: Story, serial_number: str) -> None:
+        self.story, self.name = story, story.name
+        self._identity = identity_with(serial_number)
+        self._estimates: dict[str, str] = {}  # their own numbers by those of the story, which words name
 
     def results(self, number: int, t_utc_ns: int, first_sequence: int) -> list[Result]:
         """The results of round `number` (from 0), numbered from `first_sequence`."""
-        self._begun_utc_ns = self._begun_utc_ns or t_utc_ns
-        self._common: dict[str, Any] = {"run_id": "simulated", "sensor": self.name, "t_utc_ns": t_utc_ns}
-        self._sequence = first_sequence
-        odd = number >= WRONG_FROM
-        if self.behaviour == "silent" and odd:
-            return self._changed("INVALID", f"no block of {self.name} for more than 5 s")
-        if self.behaviour == "wrong" and odd:
-            return [self._window(number, used=False), *self._changed("HELD", self._contradicts())]
-        if self.behaviour == "hostile" and odd:
-            return self._changed("HELD", f"<img src=x onerror=alert({number})>\x1b[2J\u202e'; DROP TABLE result; --")
-        change = DRIFT_IN_U * number if self.behaviour == "drifting" else 0.0
-        found = [self._window(number, used=True), self._calibration(number, change * 2 * U_MAIN * NOMINAL)]
-        if change < TELLS_IN_U:
-            return [*found, *self._changed("VALID", f"{number + 1} windows")]
-        return [*found, self._drift(number, change), *self._changed("HELD", f"Sxx drifts, {change:.1f} U so far")]
+        made = self.story.results(number, t_utc_ns)
+        return [self._own(result, t_utc_ns, first_sequence + k) for k, result in enumerate(made)]
 
-    def _next(self) -> dict[str, Any]:
-        self._sequence += 1
-        return {**self._common, "sequence": self._sequence - 1}
+    def truth(self) -> dict[str, Any]:
+        """What is true of the sensor in the newest round, for comparison with what is said of it."""
+        return {"sensor": self.name, "identity": self._identity, **self.story.told()}
 
-    def _changed(self, status: Status, reason: str) -> list[Result]:
-        before, self._status = self._status, status
-        return [StatusChange(**self._next(), status=status, before=before, reason=reason)] if before != status else []
+    def _own(self, result: Result, t_utc_ns: int, sequence: int) -> Result:
+        own: dict[str, Any] = {"t_utc_ns": t_utc_ns, "sequence": sequence}
+        if isinstance(result, CalibrationUpdate):
+            own["identity"] = self._identity
+        elif isinstance(result, Estimate):
+            self._estimates[str(result.sequence)] = str(sequence)
+            own["calibration"] = msgspec.structs.replace(result.calibration, t_utc_ns=t_utc_ns, identity=self._identity)
+        elif isinstance(result, StatusChange):
+            own["reason"] = NUMBER.sub(lambda found: self._estimates.get(found[0], found[0]), result.reason)
+        return msgspec.structs.replace(result, **own)
 
-    def _contradicts(self) -> str:
-        return f"the window contradicts the calibration: statistic 812.4 above {THRESHOLD}; Syy may have moved by 3.1 %"
 
-    def _window(self, number: int, *, used: bool) -> WindowReport:
-        statistic = float(self._random.chisquare(12)) if used else 812.4
-        return WindowReport(
-            **self._next(), start_s=60.0 * number, stop_s=60.0 * (number + 1), position="30 deg", used=used,
-            reason="" if used else self._contradicts(), points=60_000, left_out=0,
-            numbers={"statistic": statistic, "statistic_threshold": THRESHOLD, "coherence": 0.998},
-        )  # fmt: skip
+def _leaned(gravity_mps2: Array, angle_rad: float, axis: int) -> Array:
+    """Gravity in the frame of a mount that has turned about its axis x, or y where `axis` is odd."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    turn = [[1, 0, 0], [0, cos, -sin], [0, sin, cos]] if axis % 2 == 0 else [[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]
+    return np.asarray(np.array(turn) @ gravity_mps2)
 
-    def _calibration(self, number: int, change: float) -> CalibrationUpdate:
-        narrow = 1.0 / np.sqrt(1.0 + min(number, 20))  # what is known grows with the windows
-        u = np.append(np.where(np.eye(3) > 0, U_MAIN, U_TRANSVERSE).ravel() * NOMINAL, np.full(3, U_OFFSET))
-        told = np.append(self._S.ravel(), self._Q) + 0.3 * narrow * u * self._random.normal(size=12)
-        told[0] += change
-        return CalibrationUpdate(
-            **self._next(), sensitivity=told[:9].reshape(3, 3).tolist(), offset=told[9:].tolist(),
-            standard_uncertainty=u.tolist(), covariance=np.diag(u**2).tolist(), coverage_factor=2.0,
-            determined=[True] * 12, method="simulated", uncertainty_kind="simulated", windows=number + 1,
-            residual_sd=[40.0] * 3, output_unit="count", identity=f"simulated {self.name}",
-            reference_temperature_degc=TEMPERATURE_DEGC, temperature_low_degc=15.0, temperature_high_degc=25.0,
-            references=["simulated reference"], reference_frequency_hz=8.0, valid_band_hz=[1.0, 40.0],
-        )  # fmt: skip
 
-    def _drift(self, number: int, change_in_u: float) -> DriftReport:
-        change = change_in_u * 2 * U_MAIN * NOMINAL
-        days = max((self._common["t_utc_ns"] - self._begun_utc_ns) / 86400e9, 1e-6)
-        return DriftReport(
-            **self._next(), parameter="Sxx", verdict="drifting", change=change, u_change=U_MAIN * NOMINAL,
-            rate=change / days, u_rate=U_MAIN * NOMINAL / days, onset_utc_ns=self._begun_utc_ns,
-            statistic=10.0 + number, threshold=9.2, false_alarms_a_year=0.1,
-            reason="the sensor or the reference changes steadily; compare with another reference",
-        )  # fmt: skip
+def _hostile(sensor: str, t_utc_ns: int) -> StatusChange:
+    """What a person with bad intentions might let a gateway say."""
+    reason = "<img src=x onerror=alert(3)>\x1b[2J\u202e'; DROP TABLE result; --"
+    return StatusChange(run_id="", sequence=0, sensor=sensor, t_utc_ns=t_utc_ns, status="HELD", before="VALID",
+                        reason=reason)  # fmt: skip

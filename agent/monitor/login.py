@@ -142,7 +142,7 @@ class Access:
         if not hmac.compare_digest(request.headers.get(TOKEN, "").encode(), session.token.encode()):
             raise HTTPException(403, "the request has not the token of this session; load the page again")
         if verb not in user.verbs:
-            raise HTTPException(403, f"{user.name} has no right to send {verb!r:.20}")
+            raise HTTPException(403, f"{user.name} has not the right {verb!r:.20}")
         return user
 
     def me(self, request: Request) -> Response:

@@ -26,6 +26,7 @@ from agent.monitor.forwarding import Forwarding
 from agent.monitor.live import Live
 from agent.monitor.login import Access
 from agent.monitor.notices import Notifier, Watch
+from agent.monitor.plan import Plans
 from agent.monitor.server import application
 from agent.monitor.settings import MonitorSettings
 from agent.monitor.summaries import Summariser
@@ -80,6 +81,7 @@ def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings
         kept = settings.database
         engine = open_engine(data_dir, kept.url)
         database = stack.enter_context(closing(Database(engine, full_days=kept.full_days)))
+        plans = Plans(engine, access, settings.plan)
         stack.callback(Summariser(database.summarise).close)
         following = Following(bus.endpoints, bus.tls, database, fleet, bus.keys)
         stack.callback(following.close)
@@ -87,9 +89,7 @@ def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings
         if settings.notices is not None:
             notifier = Notifier(Watch(fleet, settings.notices, _certificates(bus, web)), settings.notices)
             stack.callback(notifier.close)
-        app = application(
-            database, fleet, following, access, forwarding, live, stopping, web.names, settings.plan, notifier
-        )
+        app = application(database, fleet, following, access, forwarding, live, stopping, plans, web.names, notifier)
         server, bounded = web_server(app, listening, web, stopping)
         # The server raises the signal again that has ended it; SIGTERM would then end the process before what is below.
         signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -22,7 +22,6 @@ from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from agent.config.files import read_file
 from agent.monitor.advising import Advisor
 from agent.monitor.database import Database
 from agent.monitor.engines import DatabaseError
@@ -33,7 +32,7 @@ from agent.monitor.guard import Guard
 from agent.monitor.live import Live
 from agent.monitor.login import Access
 from agent.monitor.notices import Notifier
-from agent.monitor.settings import PICTURES, Plan
+from agent.monitor.plan import Plans
 from agent.monitor.trends import Trends
 from agent.terminal.text import no_formula
 
@@ -47,7 +46,6 @@ PLOTTED = (
 )  # fmt: skip
 _NUMBER = re.compile(r"[0-9]{1,9}")
 _VERSION = re.compile(r"[0-9]{1,18}")
-LARGEST_PICTURE = 32 << 20  # bytes
 SEEN_MAX = 50  # sensors of which a page asks at once
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
@@ -62,16 +60,16 @@ def application(
     forwarding: Forwarding,
     live: Live,
     stopping: threading.Event,
+    plans: Plans,
     names: Sequence[str] = (),
-    plan: Plan | None = None,
     notifier: Notifier | None = None,
 ) -> ASGIApp:
     """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
 
     `stopping` ends the streams, which a browser would keep open for ever. `names`: host names by which browsers reach
-    this server, besides localhost and IP addresses. `plan`: picture of the structure. `notifier`: its fault is shown.
+    this server, besides localhost and IP addresses. `notifier`: its fault is shown.
     """
-    data = _Data(database, fleet, following, stopping, plan, notifier)
+    data = _Data(database, fleet, following, stopping, notifier)
     app = Starlette(
         routes=[
             Route("/api/fleet", access.reading(data.sensors)),
@@ -82,7 +80,10 @@ def application(
             Route("/hours.csv", access.reading(data.hours_csv)),
             Route("/gateways.csv", access.reading(data.gateways_csv)),
             Route("/api/changes", access.reading_async(data.changes)),
-            Route("/plan", access.reading(data.plan)),
+            Route("/plan", access.reading(plans.picture)),
+            Route("/api/plan", access.reading(plans.told)),
+            Route("/api/plan/picture", plans.put_picture, methods=["POST"]),
+            Route("/api/plan/position", plans.put_position, methods=["POST"]),
             Route("/fleet.csv", access.reading(data.sensors_csv)),
             Route("/sensor.csv", access.reading(data.history_csv)),
             Route("/api/live", access.reading_async(live.stream)),
@@ -119,11 +120,11 @@ class _Data:
     """What the page asks for."""
 
     def __init__(
-        self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event, plan: Plan | None,
+        self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event,
         notifier: Notifier | None,
     ) -> None:  # fmt: skip
         self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
-        self._plan, self._notifier = plan, notifier
+        self._notifier = notifier
         self._advisor, self._trends = Advisor(database, fleet), Trends(database, fleet)
         self._listeners: set[object] = set()
 
@@ -132,24 +133,14 @@ class _Data:
         bus = following.state() | {"left_out": fleet.left_out, "verifies": following.keys is not None}
         bus["notices"] = self._notifier.fault if self._notifier is not None else ""
         fleet.look()
-        told = {"version": fleet.version, "now_utc_ns": time.time_ns(), "sensors": fleet.rows(_since(request)),
-                "gateways": fleet.gateways(following.refused), "bus": bus}  # fmt: skip
-        return _json(told | {"plan": None if self._plan is None else dict(self._plan.positions)})
+        return _json({"version": fleet.version, "now_utc_ns": time.time_ns(), "sensors": fleet.rows(_since(request)),
+                      "gateways": fleet.gateways(following.refused), "bus": bus})  # fmt: skip
 
     def trends(self, request: Request) -> Response:
         """Of the sensors that are seen (`of`: site/gateway/sensor, at most SEEN_MAX), what their histories tell."""
         asked = request.query_params.getlist("of")[:SEEN_MAX]
         places = {name: name.split("/") for name in asked if name.count("/") == 2}
         return _json({name: self._trends.of((a, b, c)) for name, (a, b, c) in places.items()})
-
-    def plan(self, _: Request) -> Response:
-        if self._plan is None:
-            return Response("no plan is configured", 404)
-        try:
-            picture = read_file(self._plan.picture, LARGEST_PICTURE)
-        except OSError as error:
-            return Response(f"the picture cannot be read: {error.strerror}", 404)
-        return Response(picture, 200, None, PICTURES[self._plan.picture.suffix.lower()])
 
     def sensors_csv(self, _: Request) -> Response:
         return _csv("fleet.csv", self._fleet.rows())

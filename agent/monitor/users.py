@@ -2,7 +2,7 @@
 
 A text file in UTF-8, one user a line; a line that begins with `#` is a comment:
 
-    user <name> <commands, such as hold,accept; or - for none> <argon2id hash>
+    user <name> <rights, such as hold,accept,plan; or - for none> <argon2id hash>
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pathlib import Path
 from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerificationError
 
-from agent.commanding.arguments import VERBS
 from agent.config.files import read_private_file
 from agent.delivery.keys import CHUNK
+from agent.monitor.rights import RIGHTS
 
 LARGEST = 1 << 20  # bytes of the file; thousands of users
 SHORTEST_PASSWORD = 12  # characters; NIST SP 800-63B asks for 8, and for more where there is no second factor
@@ -35,7 +35,7 @@ class UsersError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class User:
-    """A user with the commands that the page forwards for this user. `hashed`: the password, by argon2id."""
+    """A user. `verbs`: commands that the page forwards for this user, and PLAN. `hashed`: the password, by argon2id."""
 
     name: str
     verbs: tuple[str, ...]
@@ -81,10 +81,10 @@ def read_users(path: Path) -> dict[str, User]:
             continue
         words, where = line.split(), f"{path}: line {number}"
         if len(words) != 4 or words[0] != "user" or not CHUNK.fullmatch(words[1]):
-            raise UsersError(f"{where}: not `user <name> <commands> <argon2id hash>`")
+            raise UsersError(f"{where}: not `user <name> <rights> <argon2id hash>`")
         verbs = () if words[2] == "-" else tuple(words[2].split(","))
-        if unknown := [verb for verb in verbs if verb not in VERBS]:
-            raise UsersError(f"{where}: {unknown[0]!r:.40} is no command; the commands are {', '.join(VERBS)}")
+        if unknown := [verb for verb in verbs if verb not in RIGHTS]:
+            raise UsersError(f"{where}: {unknown[0]!r:.40} is no right; the rights are {', '.join(RIGHTS)}")
         if words[1] in users:
             raise UsersError(f"{where}: the user {words[1]} is there twice")
         if not words[3].startswith("$argon2id$"):
@@ -103,7 +103,7 @@ def set_user(path: Path, name: str, verbs: tuple[str, ...], password: str) -> No
     if not SHORTEST_PASSWORD <= len(password) <= LONGEST_PASSWORD:
         raise UsersError(f"a password has {SHORTEST_PASSWORD} to {LONGEST_PASSWORD} characters, not {len(password)}")
     users = read_users(path) if path.exists() else {}
-    users[name] = User(name, tuple(verb for verb in VERBS if verb in verbs), _HASHER.hash(password))
+    users[name] = User(name, tuple(verb for verb in RIGHTS if verb in verbs), _HASHER.hash(password))
     lines = [f"user {user.name} {','.join(user.verbs) or '-'} {user.hashed}\n" for user in users.values()]
     draft = path.with_name(f"{path.name}.new")
     try:

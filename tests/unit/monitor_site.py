@@ -24,8 +24,10 @@ from agent.monitor.following import Following
 from agent.monitor.forwarding import Forwarding
 from agent.monitor.live import Live
 from agent.monitor.login import Access
+from agent.monitor.plan import Plans
 from agent.monitor.running import Web, web_server
 from agent.monitor.server import application
+from agent.monitor.settings import Plan
 from tests.unit.zenoh_site import Site, wait_for
 
 STARTS_S = 30.0
@@ -47,24 +49,29 @@ class Answer:
 class Served(AbstractContextManager["Served"]):
     """The server in a thread, on a free port of loopback, with a fleet that the test fills.
 
-    `keys`: known keys; `users`: who may log in; `behind_proxy`: on loopback; `more`: of the application.
+    `keys`: known keys; `users`: who may log in; `plan`: that of the configuration; `behind_proxy`: on loopback;
+    `more`: of the application.
     """
 
     def __init__(
-        self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None, *,
-        behind_proxy: bool = False, **more: Any,
+        self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None,
+        plan: Plan | None = None, *, behind_proxy: bool = False, **more: Any,
     ) -> None:  # fmt: skip
         self._open = ExitStack()
         directory.mkdir(exist_ok=True)
-        self.database = self._open.enter_context(closing(Database(Sqlite(directory / "monitor.sqlite"))))
+        engine = Sqlite(directory / "monitor.sqlite")
+        self.database = self._open.enter_context(closing(Database(engine)))
         self.fleet = Fleet()
         self.following = Following([site.endpoint], None, self.database, self.fleet, keys)
         self._open.callback(self._end_following)
         access = Access(users)
         forwarding = Forwarding([site.endpoint], None, access, self.fleet)
         stopping = threading.Event()
-        live = Live([site.endpoint], None, stopping)
-        app = application(self.database, self.fleet, self.following, access, forwarding, live, stopping, **more)
+        self.live = Live([site.endpoint], None, stopping)
+        plans = Plans(engine, access, plan)
+        app = application(
+            self.database, self.fleet, self.following, access, forwarding, self.live, stopping, plans, **more
+        )
         listening = self._open.enter_context(closing(socket.create_server(("127.0.0.1", 0))))
         self.address = f"127.0.0.1:{listening.getsockname()[1]}"
         web = Web(names=(), users=users, certificate=None, key=None, behind_proxy=behind_proxy)

@@ -302,3 +302,22 @@ def test_the_configuration_of_the_database(tmp_path: Path) -> None:
         with pytest.raises(Exception, match=told) as refused:
             load_settings(file)
         assert "SECRET" not in str(refused.value)
+
+
+def test_the_plan_is_kept(kept: Kept) -> None:
+    for extra in ("starlette", "argon2"):
+        pytest.importorskip(extra, reason="the extra monitor is not installed")
+    from starlette.requests import Request
+
+    from agent.monitor.login import Access
+    from agent.monitor.plan import Plans, Position
+
+    first, asked = Plans(kept.engine, Access(None)), Request({"type": "http"})
+    for data in (b"a picture", b"another one"):
+        first.keep("image/png", data)
+    for name, at in (("mems", (0.1, 0.2)), ("mems", (0.123456789, 0.75)), ("other", (0.0, 1.0)), ("other", None)):
+        first.place(Position(f"site/gw/{name}", at))
+    later = Plans(kept.engine, Access(None))
+    told = msgspec.json.decode(bytes(later.told(asked).body))
+    assert told["positions"] == {"site/gw/mems": [0.123456789, 0.75]}
+    assert bytes(later.picture(asked).body) == b"another one"
