@@ -132,6 +132,7 @@ class Streaming:
             sensor="mems", t_utc_ns=time.time_ns(), first_index=self._index, rate_hz=RATE_HZ, acceleration=values,
             covariance=np.eye(3), noise=np.ones(3), determined=np.ones(12, dtype=bool), calibration_run_id="r",
             calibration_sequence=103, dynamic_only=False, recorded=False,
+            suspect=np.zeros(3, dtype=bool),
         )  # fmt: skip
         self._index += count
         self._publisher.stream("mems", encode_acceleration(1, block))

@@ -19,6 +19,7 @@ def block(values: np.ndarray, first_index: int, rate_hz: float = RATE_HZ) -> Acc
         sensor="s", t_utc_ns=10**9 * first_index, first_index=first_index, rate_hz=rate_hz,
         acceleration=values, covariance=np.eye(3), noise=np.ones(3), determined=np.ones(12, dtype=bool),
         calibration_run_id="r", calibration_sequence=1, dynamic_only=False, recorded=False,
+        suspect=np.zeros(3, dtype=bool),
     )  # fmt: skip
 
 
