@@ -23,9 +23,11 @@ if TYPE_CHECKING:
 SCENARIOS = "tests/scenarios/"
 NICE = 5  # of processes that take other tests
 
-# A shell starts a command in the background with SIGINT ignored, and every child of the tests would ignore Ctrl-C too.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell starts a command in the background with SIGINT ignored, and nohup with SIGHUP: every child of the tests would
+# ignore Ctrl-C and the end of its terminal too.
+for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 # Examples follow from the test's own code, so that a failure comes again; time limits fail on a machine under load.
 settings.register_profile("fieldcal", deadline=None, derandomize=True)
