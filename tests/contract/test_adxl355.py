@@ -122,8 +122,9 @@ class TestAdxl355(I2cContract):
 
     @on_one_adapter
     def test_a_temperature_that_changes_while_it_is_read_is_not_torn(self, rig: Adxl355Rig) -> None:
-        # 0x6FF and 0x700 in turn, every 1.7 ms: 19 of 1200 single readings have the high byte of one and the low byte
-        # of the other, which is 28 K away. At a low rate the FIFO is read a few times for each block and its temperature.
+        # 0x6FF and 0x700 in turn, every 1.7 ms: 17 of 1200 single readings have the high byte of one and the low byte
+        # of the other, which is 28 K away. At a low rate the FIFO is polled less often for each block, which has one
+        # temperature.
         rig.rate_hz = 62.5
         rig.sensor = rig.build(rate_hz=rig.rate_hz)
         rig.put(timed(rig, lambda t_s: 0x6FF + int(t_s / 1.7e-3) % 2))
