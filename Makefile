@@ -39,7 +39,7 @@ PROCESSES = $$((2 * $$(nproc)))
 # reads a million.
 test: export FIELDCAL_CONTRACT_SAMPLES = 90000
 test: $(VENV)/development
-	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadscope -m "not faults" || \
+	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadscope --no-loadscope-reorder -m "not faults" || \
 		$(call once_more,-m "not faults")
 
 nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt

@@ -38,13 +38,11 @@ class ScenariosBesideTheRest(LoadScopeScheduling):
     """Gives the scenarios to every second process, and the other tests to the others, until one kind has run out.
 
     A scenario waits most of its time for a program that runs against the clock; meanwhile the other tests compute.
-    Scenarios of files with few tests come first: one that takes a minute is nearly alone in its file.
     """
 
     def _assign_work_unit(self, node: WorkerController) -> None:
         for_scenarios = takes_scenarios(node)
-        scopes = reversed(self.workqueue) if for_scenarios else iter(self.workqueue)
-        wanted = next((scope for scope in scopes if scope.startswith(SCENARIOS) == for_scenarios), None)
+        wanted = next((scope for scope in self.workqueue if scope.startswith(SCENARIOS) == for_scenarios), None)
         if wanted is not None:
             self.workqueue.move_to_end(wanted, last=False)
         super()._assign_work_unit(node)
@@ -53,6 +51,13 @@ class ScenariosBesideTheRest(LoadScopeScheduling):
 def takes_scenarios(node: WorkerController) -> bool:
     """Whether this process of xdist (gw0, gw1, ...) takes scenarios first."""
     return int(node.gateway.id.removeprefix("gw")) % 2 == 0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with a slow test come first: as one of the last they would keep one process busy while the others have
+    ended."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling | None:

@@ -6,10 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 FILES = 45
 
 
+@pytest.mark.slow
 def test_no_hostile_file_ends_a_command_with_a_fault() -> None:
     """No exit status but 0, 2 and 3, no traceback, no control character, memory and CPU time within the limits."""
     run = [sys.executable, "-m", "benchmarks.hostile_files", "--quick", "--count", str(FILES)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +18,7 @@ LONGEST_S = 1.5  # of the schedule's poses, guards taken off, and a sample
 seeds = st.integers(0, 2**32 - 1)
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(seed=seeds, reference=st.booleans())
 @example(seed=9, reference=True)  # five calibrations each, which few seeds have
@@ -34,6 +36,7 @@ def test_restored_at_any_event_it_goes_on_alike(seed: int, reference: bool) -> N
     assert restored.snapshot() == going_on.snapshot()
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(seed=seeds, reference=st.booleans())
 @example(seed=9, reference=True)  # five calibrations each, which few seeds have

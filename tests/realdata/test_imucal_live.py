@@ -56,6 +56,7 @@ def published(endpoint: str) -> list[dict[str, Any]]:
         return [json.loads(reply.ok.payload.to_string()) for reply in session.get(KEY) if reply.ok is not None]
 
 
+@pytest.mark.slow
 def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path, router: str) -> None:
     as_files(tmp_path)
     rests = np.loadtxt(tmp_path / "poses.csv", delimiter=",", skiprows=1)

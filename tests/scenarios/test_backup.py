@@ -43,6 +43,7 @@ def answer(data_dir: Path, command: bytes) -> dict[str, Any]:
         return dict(json.loads(agent.send("imu/command/hold", command)))
 
 
+@pytest.mark.slow
 def test_a_restored_directory_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     private, public = write_keys(tmp_path)
     config, data_dir, copy = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "copy"

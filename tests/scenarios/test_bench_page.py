@@ -39,6 +39,7 @@ def rows(page: Any, caption: str) -> list[list[str]]:
     return [row.locator("td").all_inner_texts() for row in table.all()]
 
 
+@pytest.mark.slow
 def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, browser: Any) -> None:
     monitor = Monitor(site.endpoint, tmp_path / "monitor")
     try:
@@ -99,6 +100,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
         monitor.stop()
 
 
+@pytest.mark.slow
 def test_a_killed_program_is_shown_as_silent(site: Site, tmp_path: Path, browser: Any) -> None:
     monitor = Monitor(site.endpoint, tmp_path / "monitor")
     command = [sys.executable, "-m", "agent", "bench", "-o", str(tmp_path / "out"), "--virtual", "gravity"]

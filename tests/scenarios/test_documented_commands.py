@@ -36,6 +36,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_documented_commands_run(page: Path, tmp_path: Path, data_dir: Path) -> None:
     shutil.copytree(ROOT / "examples", tmp_path / "examples")

@@ -22,6 +22,7 @@ def _errors_over_u(output: Path, kind: str, seed: int) -> np.ndarray:
     return (np.array(found["sensitivity"]) - truth) / np.array(found["expanded_uncertainty"]["sensitivity"])
 
 
+@pytest.mark.slow
 def test_a_clamp_with_a_wrong_turn(tmp_path):
     """The wrong turn is noticed with its name; turned right, the session ends where it was wanted, and S is right."""
     wrong = iter(["", "hand 35 60"])
@@ -47,6 +48,7 @@ def test_a_clamp_with_a_wrong_turn(tmp_path):
     assert (tmp_path / "out" / "result.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_stop_is_taken_back_and_a_session_ended_early(tmp_path):
     """A position is named by the person, one is taken back, a wrong name is told; the files hold what was kept."""
     answers = iter(["", "u", "no position", "-x", "q"])

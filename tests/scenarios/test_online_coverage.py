@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from agent.core.events import CalibrationUpdate, WindowReport
 from benchmarks.online import coverage
@@ -54,6 +55,7 @@ def _within(n: int, low: int, high: int, share: float) -> float:
     return float(np.mean((draws >= low) & (draws <= high)))
 
 
+@pytest.mark.slow
 def test_the_first_window_alone_is_as_uncertain_as_it_says() -> None:
     """The colour of the noise is estimated from the segments of this one window.
 

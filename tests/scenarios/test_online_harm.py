@@ -20,6 +20,7 @@ from hw.virtual.harm_kinds import KINDS
 HOPELESS = ("reference unplugged", "dead channel of the sensor", "swapped axes", "knocked off its mount", "clipping")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_nothing_wrong_gets_in(kind: str) -> None:
     for seed in (harm.SEED + 7, harm.SEED + 8):

@@ -27,6 +27,7 @@ def followed(elsewhere: float) -> Year:
     return year.whole(world(elsewhere), DAYS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elsewhere", [0.0, 0.3])
 def test_a_step_of_one_per_cent_is_found_and_followed(elsewhere: float) -> None:
     building, seen = world(elsewhere), followed(elsewhere)

@@ -114,6 +114,7 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
     return all(one[name] == other[name] for name in ("sensitivity", "offset", "covariance", "determined"))
 
 
+@pytest.mark.slow
 def test_after_the_upgrade_the_calibration_of_the_older_version_is_in_force(day: Day) -> None:
     first = day.of_run(0)[0]
     assert same(first, day.golden)

@@ -59,6 +59,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return data_dir
 
 
+@pytest.mark.slow
 def test_the_chain_and_each_file_alone_replay_bit_for_bit(data_dir: Path) -> None:
     files = recordings(data_dir)
     assert len(files) >= 4

@@ -92,6 +92,7 @@ def truth(preset: str) -> Truth:
     return Bench(PRESETS[preset](SEED), SEED).truth
 
 
+@pytest.mark.slow
 def test_s_and_q_are_right_within_a_minute(run: Run) -> None:
     last = results(run.data_dir, "calibration")[-1]
     true = truth("plain")

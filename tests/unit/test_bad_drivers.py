@@ -141,6 +141,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_bug_costs_what_it_breaks_and_nothing_else(runs: dict[str, Run], bug: str) -> None:
     found = runs[bug]

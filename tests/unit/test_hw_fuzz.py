@@ -7,6 +7,7 @@ import pytest
 from benchmarks.fuzz_drivers import fuzz, parsers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1])
 def test_no_exception_and_no_growth(seed: int) -> None:
     rows = fuzz(10_000 // len(parsers()), seed)

@@ -126,6 +126,7 @@ def test_the_part_of_axes_that_differ_is_that_of_a_corner() -> None:
     assert found.more["budget"]["response by axis"]["Sxx"] == pytest.approx(expected, rel=0.15)
 
 
+@pytest.mark.slow
 def test_axes_whose_corners_differ_by_one_per_cent_are_covered() -> None:
     """20 seeds, 60 main sensitivities. Before, errors were up to 8 u. Without the reference's error, which is none
     here, its u does not count."""
@@ -208,6 +209,7 @@ def test_corners_that_differ_explain_deviations_of_bands() -> None:
     assert BetweenBands(shift=0.5 * found.explains).beyond(found.explains) == 0.5 * found.explains
 
 
+@pytest.mark.slow
 def test_deviations_that_axes_explain_do_not_count_twice() -> None:
     """20 seeds of order 4 near the motion: bands deviate by 0.1 %, S of an axis is off by a sixth of that, and u says
     so. Before, u without the reference's was 0.8 to 1.1e-3."""

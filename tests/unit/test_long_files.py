@@ -33,16 +33,19 @@ def calibrated(sensor: Path, reference: Path, count: int) -> float:
     return peak_mb
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["parquet", "csv"])
 def test_calibrate_from_files(ending: str, tmp_path: Path) -> None:
     assert grew([calibrated(*WRITERS[ending](tmp_path, n, 1), n) for n in LENGTHS_MIN]) < MOST_GROWTH_MB
 
 
+@pytest.mark.slow
 def test_calibrate_from_a_recording(recordings: list[Path]) -> None:
     peaks_mb = [calibrated(path, path, count) for path, count in zip(recordings, LENGTHS_MIN, strict=True)]
     assert grew(peaks_mb) < MOST_GROWTH_MB
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["parquet", "mcap"])
 def test_export(ending: str, recordings: list[Path], tmp_path: Path) -> None:
     option = "--mcap" if ending == "mcap" else "--to"
