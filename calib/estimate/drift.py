@@ -117,7 +117,7 @@ class DriftTest:
         margin = {"stable": 0.0, "stepped": OTHER_SHAPE, "drifting": -OTHER_SHAPE}[before.verdict]
         self._onsets.pin(p, ramp.onset if for_ramp > margin else step.onset)
         base = DriftVerdict(held.parameter, statistic=statistic, threshold=threshold)
-        return _drifting(base, ramp, self._newest_s) if for_ramp > margin else _stepped(base, step)
+        return _drifting(base, ramp, self._newest_s) if for_ramp > margin else _stepped(base, step, self._newest_s)
 
     def snapshot(self) -> dict[str, Any]:
         """The complete state, for `load`; bit for bit."""
@@ -141,8 +141,9 @@ def _calmed(before: DriftVerdict, now: DriftVerdict) -> bool:
     return before.verdict != "stable" and now.verdict == "stable"
 
 
-def _stepped(base: DriftVerdict, step: Change) -> DriftVerdict:
-    text = f"{base.parameter} stepped by {step.size:+.3g} (u {step.u_size:.2g}) at {step.onset_s:.0f} s"
+def _stepped(base: DriftVerdict, step: Change, t_s: float) -> DriftVerdict:
+    days = (t_s - step.onset_s) / DAY_S
+    text = f"{base.parameter} stepped by {step.size:+.3g} (u {step.u_size:.2g}) {days:.1f} days ago"
     return replace(
         base,
         verdict="stepped",
@@ -157,8 +158,8 @@ def _drifting(base: DriftVerdict, ramp: Change, t_s: float) -> DriftVerdict:
     days = (t_s - ramp.onset_s) / DAY_S
     change, u_change = ramp.size * days, ramp.u_size * days
     text = (
-        f"{base.parameter} drifts by {ramp.size:+.3g} (u {ramp.u_size:.2g}) a day since {ramp.onset_s:.0f} s; in these "
-        f"{days:.1f} days it has drifted by {change:+.3g}"
+        f"{base.parameter} drifts by {ramp.size:+.3g} (u {ramp.u_size:.2g}) a day; in the last {days:.1f} days "
+        f"it has drifted by {change:+.3g}"
     )
     return replace(
         base,
