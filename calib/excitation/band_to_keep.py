@@ -10,7 +10,7 @@ from calib.signal.band import STOP_BAND, band_above_noise, noise_in_bands, power
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import BAND, DIFFERENTIATED_BAND_HZ, differentiated_band_hz
 
-NOISE_MATTERS = 1e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
+NOISE_MATTERS = 1.4e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
 FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
 # 1 % of gravity. A reference that moves by more beside a sensor does not rest.
 LEAST_MOTION_MPS2 = 0.1

@@ -13,6 +13,7 @@ from calib.estimate.condense import condense, mean_frequency_hz
 from calib.estimate.lag_search import correlated_lag_s, largest_omega, without_lag
 from calib.estimate.norm_fit import norm_fit
 from calib.estimate.nuisances import Applied, Priors
+from calib.estimate.quantities import RESPONSE
 from calib.estimate.response_by_band import told_by_band
 from calib.estimate.response_told import LEFT_U, ResponseTold
 from calib.estimate.verdict import MOST_BETWEEN_BANDS, response_reasons
@@ -39,7 +40,9 @@ LEAST_USED = 0.05  # of the points in motion
 MAIN = [0, 4, 8]  # of PARAMETERS
 HALF_OCTAVE = 2.0**0.5
 RESPONSE_TURNS = 6
-BETTER = 1.25  # times: largest u of the main sensitivities from all windows over that from rests alone
+BETTER = 1.25  # times: largest u of the main sensitivities from rests alone over that from all windows
+# Prior standard uncertainties from which on an attenuation at one frequency is not that of a filter with this lag.
+UNLIKELY = 3.0
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 
 
@@ -287,8 +290,8 @@ def _attenuated(found: Adjustment, windows: Sequence[Window], priors: Priors, ap
 
 
 def _at_rest(told: _Told, priors: Priors) -> tuple[Outcome, Adjustment | None]:
-    """The outcome and its adjustment: those of the rests alone, with S at 0 Hz, where they tell S better than all
-    windows do at the frequency of the motion, and nobody stated a frequency.
+    """The outcome and its adjustment: those of the rests alone, with S at 0 Hz, where they tell S about as well as all
+    windows do at the frequency of the motion, or contradict the motion, and nobody stated a frequency.
 
     Motion takes no part: how far S changes from its frequency down to 0 Hz is known only where rests tell S themselves.
     """
@@ -299,9 +302,20 @@ def _at_rest(told: _Told, priors: Priors) -> tuple[Outcome, Adjustment | None]:
     steady = adjust(rests, priors, found.grounds.applied)
     u, u_at_rest = (np.nan_to_num(a.calibration.standard_uncertainty[MAIN], nan=np.inf) for a in (found, steady))
     lost = found.calibration.determined & ~steady.calibration.determined
-    if lost.any() or not np.max(u) > BETTER * np.max(u_at_rest) or steady.reasons:
+    alone = BETTER * np.max(u) > np.max(u_at_rest) or _contradicts_rests(found)
+    if lost.any() or not alone or steady.reasons:
         return outcome, found
     return replace(_outcome(steady, outcome.windows, outcome.rate_hz), lag_s=outcome.lag_s), steady
+
+
+def _contradicts_rests(found: Adjustment) -> bool:
+    """Whether S at the only frequency of the motion and at 0 Hz differ by more than a filter with this lag can make it:
+    of a tone on an ellipse another lag and another S fit as well."""
+    priors = found.grounds.priors
+    if not priors.response_model.one_frequency:
+        return False
+    (attenuation,) = (n.value for n in found.nuisances if n.kind is RESPONSE)
+    return abs(attenuation - priors.response_at) > UNLIKELY * priors.response
 
 
 def _used(windows: Sequence[Window]) -> list[Window]:

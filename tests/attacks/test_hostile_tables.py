@@ -226,7 +226,7 @@ def test_a_recording_whose_snapshot_is_damaged_is_refused_in_one_line(
     assert re.search("snapshot: (KeyError|ValueError): ", lines[0])
 
 
-@pytest.mark.parametrize("ending", ["csv", "wav", "mseed"])
+@pytest.mark.parametrize("ending", ["csv", "uff", "mseed"])
 def test_samples_whose_times_do_not_rise_are_not_exported(
     ending: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -93,7 +93,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
         page.set_viewport_size({"width": 390, "height": 800})  # a phone: nothing is cut but wide tables, which scroll
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 390
         page.emulate_media(color_scheme="dark")
-        page.wait_for_function("() => getComputedStyle(document.body).backgroundColor === 'rgb(18, 18, 18)'")
+        page.wait_for_function("() => getComputedStyle(document.body).backgroundColor === 'rgb(15, 21, 27)'")
         assert faults(page) == []
         watched.close()  # no request to outside, no error
     finally:

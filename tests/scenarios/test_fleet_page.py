@@ -253,7 +253,7 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
     try:
         watched = Watched(browser, monitor.address)
         page = watched.open()
-        page.get_by_text("1 sensor, on the bus").wait_for()
+        page.get_by_text(re.compile(r"1 sensor, (running|on the bus)")).wait_for()
         wait_for(lambda: len(monitor.get(asked)) > 3)
         gateway.kill()
         gateway.wait()
