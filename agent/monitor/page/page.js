@@ -51,7 +51,7 @@ function summary() {
   return [
     `Sensors: ${told.sensors.length}`, need ? `${need} not in order` : "all in order", bus.verifies ? "signatures verified" : "signatures not verified (option --keys)",
     bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "", bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "",
-    bus.malformed ? `${bus.malformed} messages were no results` : "", bus.last_result_age_s > OLD_S ? `no result for ${duration(bus.last_result_age_s * 1e9)}` : "", bus.fault, bus.notices,
+    bus.last_result_age_s > OLD_S ? `no result for ${duration(bus.last_result_age_s * 1e9)}` : "", bus.fault, bus.notices,
   ].filter(Boolean).join("; ");
 }
 
