@@ -127,7 +127,7 @@ def test_a_ramp_is_told_as_drift_with_its_rate(rate_a_window: float, within: int
     assert after.change == pytest.approx(rate_a_window * (feed.count - 1 - QUIET_WINDOWS), rel=0.05)
     assert after.u_change / after.change == pytest.approx(after.u_rate / after.rate)
     days = (feed.count - 1) / 24 - after.onset_s / 86400
-    assert f"; in these {days:.1f} days it has drifted by {after.change:+.3g}; " in after.reason
+    assert f"; in the last {days:.1f} days it has drifted by {after.change:+.3g}; " in after.reason
     assert after.u_rate < 0.05 * after.rate
     assert after.rate == pytest.approx(24 * rate_a_window, abs=4 * after.u_rate)
 
