@@ -16,8 +16,11 @@ from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from xdist.remote import Producer
 
+    from agent.delivery.store import Store
     from tests.unit.zenoh_site import Site
 
 SCENARIOS = "tests/scenarios/"
@@ -83,6 +86,16 @@ def _signals_as_before() -> Iterator[None]:
     for number, handler in before.items():
         if handler is not None and signal.getsignal(number) is not handler:
             signal.signal(number, handler)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """An empty store, whose results count from 0."""
+    from agent.delivery.store import Store
+
+    store = Store(tmp_path, 0)
+    yield store
+    store.close()
 
 
 @pytest.fixture

@@ -37,10 +37,11 @@ class Instances:
     """Watches the gateways under the key expression `key`. `look` brings `doubled` up to date.
 
     `doubled`: the instances that are there, the oldest first, of each gateway (`<site>/<gateway>`) with more than one.
-    `close` before the session ends.
+    `clock`: a monotonic time in s. `close` before the session ends.
     """
 
-    def __init__(self, session: zenoh.Session, key: str) -> None:
+    def __init__(self, session: zenoh.Session, key: str, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self.doubled: dict[str, tuple[str, ...]] = {}
         self._mutex = threading.Lock()
         self._since_s: dict[str, dict[str, float]] = {}  # monotonic time of each instance, by gateway
@@ -54,7 +55,7 @@ class Instances:
 
     def look(self) -> None:
         """Find the gateways that are there twice, at most each LOOK_S; a new one is logged."""
-        if (now_s := time.monotonic()) < self._look_s:
+        if (now_s := self._clock()) < self._look_s:
             return
         self._look_s = now_s + LOOK_S
         with self._mutex:
@@ -75,7 +76,7 @@ class Instances:
             if token.kind != zenoh.SampleKind.PUT:
                 since_s.pop(instance, None)
             elif len(since_s) < INSTANCES_MAX and (since_s or len(self._since_s) < GATEWAYS_MAX):
-                since_s.setdefault(instance, time.monotonic())
+                since_s.setdefault(instance, self._clock())
             if since_s:
                 self._since_s[source] = since_s
             else:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import shutil
 import socket
 import subprocess
-import time
 from pathlib import Path
 from typing import Any, Self
 
 import pytest
+
+from tests.unit.zenoh_site import wait_for
 
 MOSQUITTO = shutil.which("mosquitto")
 needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="needs Debian's mosquitto")
@@ -34,14 +35,15 @@ class Broker:
     def start(self) -> Self:
         """Start it, and wait until it listens."""
         self.process = subprocess.Popen(["mosquitto", "-c", self._config], stderr=subprocess.DEVNULL)
-        end = time.monotonic() + 10
-        while True:
-            try:
-                socket.create_connection(("127.0.0.1", self.port), 1).close()
-                return self
-            except OSError:
-                assert time.monotonic() < end, "mosquitto does not listen"
-                time.sleep(0.01)
+        wait_for(self._listens)
+        return self
+
+    def _listens(self) -> bool:
+        try:
+            socket.create_connection(("127.0.0.1", self.port), 1).close()
+        except OSError:
+            return False
+        return True
 
     def kill(self) -> None:
         """End it as a power cut does."""
@@ -63,10 +65,7 @@ class Subscriber:
         self._client.on_subscribe = lambda *_: subscribed.append(1)
         self._client.connect("127.0.0.1", broker.port)
         self._client.loop_start()
-        end = time.monotonic() + 10
-        while not subscribed:
-            assert time.monotonic() < end, "no subscription"
-            time.sleep(0.01)
+        wait_for(lambda: bool(subscribed))
 
     def _take(self, message: Any) -> None:
         self.came.append((message.topic, message.payload, message.retain))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -14,13 +13,6 @@ from agent.delivery.history import History
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from tests.unit.zenoh_site import KEY, Site, record, wait_for
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(tmp_path, 0)
-    yield store
-    store.close()
 
 
 @pytest.fixture

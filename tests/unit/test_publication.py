@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import psutil
 import pytest
@@ -20,13 +19,6 @@ from tests.unit.results import clock
 from tests.unit.zenoh_site import KEY, Site, record, sequence_of, wait_for
 
 ALL = zenoh.ConsolidationMode.NONE
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = Store(tmp_path, 0)
-    yield store
-    store.close()
 
 
 @pytest.fixture
