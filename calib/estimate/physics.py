@@ -2,16 +2,18 @@
 
 For output axis i, with the row S_i of S,
 
-    a(t)            D u(t - lag) + R q u'(t) / omega + G,   D = R (D0 + t L) / (1 + r),   G = R' G0 (1 + dg / |G0|)
+    a(t)            D u(t - lag) + R q u'(t) / omega + G,   G = R' G0 (1 + dg / |G0|)
+    D               R (D0 + t L) (1 + T)^-1 / (1 + r)
     slope on u      S_i D (1 - lag^2 omega^2 / 2)
     slope on du/dt  -S_i D lag + S_i R q / omega
     mean of V       S_i (D mean(u) + G) + Q_i + S_i (R q / omega - lag D) mean(du/dt), and Q's change with temperature
 
 R, R' turn the directions of motion and of gravity, r is the relative error of the reference, t and q the relative
-motion along L that a uniaxial reference does not measure, in phase and 90 deg ahead. S is that at the reference
-frequency, S0 that at 0 Hz, for gravity and means. What the front end leaves of the response over frequency is small:
-it adds to the slopes, and to ln(S0 / S), linearly. Were its square in the equations, terms that no motion tells would
-go where noise makes the square small.
+motion along L that a uniaxial reference does not measure, in phase and 90 deg ahead. A reference with three axes
+indicates (1 + r) (1 + T) times its motion; T has its transverse sensitivities, and zeros for the main ones. S is that
+at the reference frequency, S0 that at 0 Hz, for gravity and means. What the front end leaves of the response over
+frequency is small: it adds to the slopes, and to ln(S0 / S), linearly. Were its square in the equations, terms that no
+motion tells would go where noise makes the square small.
 
 Each unknown acts on the inputs linearly (calib.estimate.unknowns); S and r are those at the temperature of the window.
 So the derivative by the unknowns is the one by the inputs times a constant matrix for each window, and the one by the
@@ -35,13 +37,14 @@ STEP = 1e-30  # of the complex step: its square is lost beside 1, so that the de
 AT_ONCE = 1000  # windows times inputs whose derivatives are found together: some 3 MB
 _PARTS = {
     "S": 9, "Q": 3, "TURN": 3, "TURN_GRAVITY": 3, "ACROSS": 3, "AHEAD": 3, "LAG": 3, "CORNER": 1,
-    "GRAVITY": 1, "REFERENCE": 3, "RESPONSE": TERMS, "OVER_T": 6,
+    "GRAVITY": 1, "REFERENCE": 3, "RESPONSE": TERMS, "OVER_T": 6, "ACROSS_REFERENCE": 6,
 }  # fmt: skip
 _ENDS = np.cumsum([0, *_PARTS.values()]).tolist()
 (
-    S, Q, TURN, TURN_GRAVITY, ACROSS, AHEAD, LAG, CORNER, GRAVITY, REFERENCE, RESPONSE, OVER_T
+    S, Q, TURN, TURN_GRAVITY, ACROSS, AHEAD, LAG, CORNER, GRAVITY, REFERENCE, RESPONSE, OVER_T, ACROSS_REFERENCE
 ) = (slice(first, stop) for first, stop in pairwise(_ENDS))  # fmt: skip
 SIZE = _ENDS[-1]  # of the inputs
+BESIDE = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))  # axis of the reference, and of the motion that it shows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,9 +205,18 @@ def felt_motion(p: Array, direction: Array) -> Array:
     real = own_channels(channels)
     sideways = direction + p[..., ACROSS][..., None] * np.eye(1, channels)[0]
     felt = rotation(p[..., TURN]) @ sideways[..., :real]
+    if real == 3 and p[..., ACROSS_REFERENCE].any():
+        felt = felt @ np.linalg.inv(np.eye(real) + indicated_beside(p[..., ACROSS_REFERENCE]))
     felt = np.concatenate([felt, p[..., CORNER][..., None] * felt], axis=-1)[..., :channels]
     channel = np.resize(np.arange(max(real, 1)), channels)  # integrals have the error of their own channel
     return np.asarray(felt / (1.0 + p[..., REFERENCE][..., channel])[..., None, :])
+
+
+def indicated_beside(across: Array) -> Array:
+    """T (..., 3, 3) of the transverse sensitivities (..., 6) of a reference, which stand as in BESIDE."""
+    found = np.zeros((*across.shape[:-1], 3, 3), across.dtype)
+    found[..., *np.array(BESIDE).T] = across
+    return found
 
 
 def felt_gravity(p: Array, gravity: Array) -> Array:

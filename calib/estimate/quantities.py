@@ -65,6 +65,8 @@ class Kind:
     another "filter", a "remount" (the sensor or the reference was mounted again, or the stated poses changed).
     `of_reference`: it belongs to the reference. It stays in the state when another reference takes its place, and is
     used again when that reference comes back.
+    `of_certificate`: it is an error of the reference's certificate, so that all results with this reference share it.
+    The lag and the response belong to both instruments, the rotation to the mount.
     `of_place`: it belongs to the place of the reference. The next reference there takes it over, and may differ in it:
     nobody states how alike two references in one place are, so S owes its direction to the first of them.
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
@@ -84,6 +86,7 @@ class Kind:
     in_output_unit: bool = False
     loosened_by: tuple[Loosening, ...] = ()
     of_reference: bool = False
+    of_certificate: bool = False
     of_place: bool = False
     straight: float = STRAIGHT
     stated: bool = True
@@ -270,24 +273,29 @@ GRAVITY = Kind(
 REFERENCE = Kind(
     "reference sensitivity", "1", "reference sensitivity",
     prior=Statement("reference", 1e-3),
-    of_reference=True,
+    of_reference=True, of_certificate=True,
 )  # fmt: skip
 REFERENCE_DRIFT = Kind(  # beside the constant error of the certificate, whose prior can then be exchanged exactly
     "reference drift", "1", "reference drift",
     prior=Statement("reference_drift"),
     walk=Statement("reference_drift"),
-    of_reference=True, since_certificate=True,
+    of_reference=True, of_certificate=True, since_certificate=True,
 )  # fmt: skip
 REFERENCE_TEMPERATURE = Kind(  # its certificate holds at the temperature of S and Q
     "reference over temperature", "1/K", "reference over temperature",
     prior=Statement("reference_per_k"),
-    of_reference=True, per_k="above", straight=0.1 * STRAIGHT,
+    of_reference=True, of_certificate=True, per_k="above", straight=0.1 * STRAIGHT,
+)  # fmt: skip
+REFERENCE_TRANSVERSE = Kind(  # of a reference with several axes: by how much each shows of what is along another
+    "reference transverse sensitivity", "1", "transverse sensitivity of the reference",
+    prior=Statement("reference_transverse"),
+    of_reference=True, of_certificate=True,
 )  # fmt: skip
 REFERENCE_CORNER = Kind(
     "reference corner", "Hz", "corner frequency",
     prior=Statement("reference_corner_hz"),
     mean=Statement("reference_corner_at_hz"),
-    of_reference=True,
+    of_reference=True, of_certificate=True,
 )  # fmt: skip
 RESPONSE = Kind(
     # Of both instruments together, as the lag is.

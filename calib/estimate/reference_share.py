@@ -15,17 +15,10 @@ from typing import Any
 import numpy as np
 
 from calib.estimate.estimate import Now
-from calib.estimate.quantities import REFERENCE, REFERENCE_CORNER, REFERENCE_DRIFT, REFERENCE_TEMPERATURE
+from calib.estimate.quantities import REFERENCE, REFERENCE_CORNER
 from calib.estimate.solution import Solution
 from calib.estimate.unknowns import EXACT
 from calib.model import Array
-
-SHARED = (
-    REFERENCE,
-    REFERENCE_DRIFT,
-    REFERENCE_CORNER,
-    REFERENCE_TEMPERATURE,
-)  # lag, response and rotation are of both instruments or the mount
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +106,7 @@ def share_in(now: Now, factor: Array, reference: str, sensitivity: float) -> Ref
     own = [
         k
         for k, unknown in enumerate(now.unknowns.all)
-        if unknown.quantity.kind in SHARED and unknown.quantity.owner == reference
+        if unknown.quantity.kind.of_certificate and unknown.quantity.owner == reference
         and unknown.quantity.centre == unknown.quantity.kind.since_certificate and unknown.u > EXACT
     ]  # fmt: skip
     unknowns = [now.unknowns.all[k] for k in own]
@@ -129,7 +122,7 @@ def share_in(now: Now, factor: Array, reference: str, sensitivity: float) -> Ref
 def share_after(solution: Solution) -> ReferenceShare | None:
     """The share of the only reference of an adjustment, whose name is not known; None where it states no error."""
     terms = solution.equations.nuisances.terms
-    own = [12 + j for j, term in enumerate(terms) if term.kind in SHARED]
+    own = [12 + j for j, term in enumerate(terms) if term.kind.of_certificate]
     if not own:
         return None
     chosen = [terms[k - 12] for k in own]

@@ -31,6 +31,7 @@ class Term:
 
     Effects: `turn_direction`, `turn_gravity` (P, 3) rotation in rad; `transverse`, `quadrature` (P, 3) transverse
     motion in phase and 90 deg ahead, relative to the motion; `reference` (M,) relative error of the reference;
+    `reference_across` (6,) its transverse sensitivities, as in physics.BESIDE, over the main ones;
     `gravity` (1,) in m/s2; `offset` (P, 3) in m/s2; `lag` (3,) in s; `reference_corner`, `sensor_corner` (1,) in rad/s;
     `response` (5,) or (9,) the terms of the response in s^k (calib.signal.response).
     None means no effect. `expected` is the prior's mean. `applied` is the part that the front end has already removed
@@ -44,6 +45,7 @@ class Term:
     transverse: Array | None = None
     quadrature: Array | None = None
     reference: Array | None = None
+    reference_across: Array | None = None
     gravity: Array | None = None
     offset: Array | None = None
     lag: Array | None = None
@@ -81,6 +83,7 @@ class Term:
             (physics.ACROSS, self.transverse), (physics.AHEAD, self.quadrature), (physics.LAG, self.lag),
             (physics.GRAVITY, self.gravity), (physics.RESPONSE, self.response), (physics.Q, self.offset),
             (physics.REFERENCE, None if self.reference is None else self.reference[:3]),
+            (physics.ACROSS_REFERENCE, self.reference_across),
         ):  # fmt: skip
             if what is not None:
                 found[:, where.start : where.start + what.shape[-1]] += what
@@ -147,6 +150,10 @@ def _terms(poses: Sequence[Pose], channels: int, priors: Priors, reference: str)
     ):
         yield _term(name, kinds.REFERENCE, priors, owner=reference, reference=own)
         yield _term(drift, kinds.REFERENCE_DRIFT, priors, owner=reference, reference=own)
+    if own_channels(channels) == 3 and priors.of(kinds.REFERENCE_TRANSVERSE.prior):
+        for (own_axis, shown), one in zip(physics.BESIDE, np.eye(6), strict=True):
+            name = f"reference_{AXES[own_axis]}{AXES[shown]}"
+            yield _term(name, kinds.REFERENCE_TRANSVERSE, priors, reference, reference_across=one)
     yield _term("lag", kinds.LAG, priors, reference, lag=np.ones(3))
     for name, k in zip(_axes("lag"), np.eye(3), strict=True):
         yield _term(name, kinds.LAG_OF_AXIS, priors, owner=reference, lag=k)
