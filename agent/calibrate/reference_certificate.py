@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.calibrate.origin import source_file
+from agent.config.certified import u_transverse
 from agent.config.earlier import MAIN, EarlierError, identity_in, read_earlier
 from agent.config.knowledge import Certificate
 from agent.config.reading import ConfigError, load_model
@@ -36,6 +37,7 @@ def read_reference_certificate(path: Path) -> ReferenceCertificate:
         stated.serial_number,
         np.array([stated.sensitivity]),
         np.array([stated.u_sensitivity_pct / 100.0]),
+        stated.u_transverse_pct / 100.0,
         (stated.corner_hz, stated.u_corner_hz) if stated.u_corner_hz else None,
         stated.known_filters,
     )
@@ -47,4 +49,7 @@ def _of_ours(path: Path, sha256: str) -> ReferenceCertificate:
     sensitivity, variance = values[MAIN], np.diag(covariance)[MAIN]
     if not np.isfinite([sensitivity, variance]).all() or (sensitivity <= 0.0).any():
         raise TableError(f"{path}: a main sensitivity of the reference is not known or not above 0")
-    return ReferenceCertificate(str(path), sha256, identity_in(path)[0], sensitivity, np.sqrt(variance) / sensitivity)
+    return ReferenceCertificate(
+        str(path), sha256, identity_in(path)[0], sensitivity, np.sqrt(variance) / sensitivity,
+        u_transverse(values, covariance),
+    )  # fmt: skip

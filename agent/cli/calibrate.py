@@ -71,9 +71,10 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
 @_u("u_offset_mps2", "u of the offset between windows.")
 @_u("u_offset_position_mps2", "u of the offset, for each position.")
 @_u("u_reference_pct", "u of the reference's sensitivity.")
+@_u("u_reference_transverse_pct", "u of the transverse sensitivities of a tri-axial reference.")
 @click.option("--reference-certificate", type=_FILE, metavar="FILE",
               help="The reference's certificate (TOML with [certificate], or JSON or DCC of `fieldcal certificate`). "
-              "Its u counts in the place of --u-reference-pct.")  # fmt: skip
+              "Its u counts in the place of --u-reference-pct and --u-reference-transverse-pct.")  # fmt: skip
 @_u("u_transverse_motion_pct", "u of motion transverse to a uniaxial reference.")
 @click.option("--sensor-filter", multiple=True, metavar="'KIND NAME=NUMBER ...'", default=DEFAULTS.sensor_filter,
               help="A known filter of the sensor, as 'lowpass order=2 corner_hz=31'; 'flat': none that matters. "

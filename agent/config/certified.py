@@ -15,10 +15,10 @@ import numpy as np
 from agent.config.earlier import LARGEST, MAIN, EarlierError, identity_in, read_earlier
 from agent.config.files import read_file
 from agent.config.names import Told
-from calib.model import scale_of
+from calib.model import Array, scale_of
 
 SPREADS = ("sensitivity", "u_sensitivity", "u_main_pct", "u_transverse_pct", "offset_mps2", "u_offset_mps2")
-CERTIFIED = ("sensitivity", "u_sensitivity_pct", "serial_number", "calibrated")
+CERTIFIED = ("sensitivity", "u_sensitivity_pct", "u_transverse_pct", "serial_number", "calibrated")
 
 
 def filled_in(raw: Mapping[str, Any]) -> tuple[Mapping[str, Any], list[Told]]:
@@ -88,6 +88,7 @@ def _prior(path: FilePath) -> dict[str, Any]:
 def _certificate(path: FilePath) -> dict[str, Any]:
     """The mean of the main sensitivities; its u has the spread of the three and the largest u of one of them.
 
+    The transverse sensitivities are not corrected for; their u has the values themselves.
     Raises EarlierError, OSError.
     """
     values, covariance = read_earlier(path)
@@ -100,4 +101,13 @@ def _certificate(path: FilePath) -> dict[str, Any]:
     u = float(np.sqrt((variance + (S - mean) ** 2).max()))
     serial_number, calibrated = identity_in(path)
     identity = {"serial_number": serial_number, "calibrated": calibrated}
-    return {"sensitivity": mean, "u_sensitivity_pct": 100.0 * u / mean} | {k: v for k, v in identity.items() if v}
+    found = {"sensitivity": mean, "u_sensitivity_pct": 100.0 * u / mean}
+    found["u_transverse_pct"] = 100.0 * u_transverse(values, covariance)
+    return found | {k: v for k, v in identity.items() if v}
+
+
+def u_transverse(values: Array, covariance: Array) -> float:
+    """Standard uncertainty of the transverse sensitivities over the main ones, of S and Q (12,) with their covariance
+    (12, 12), if nobody corrects for their values."""
+    square = (np.diag(covariance) + values**2)[:9].reshape(3, 3) / np.abs(values[MAIN])[:, None] ** 2
+    return float(np.sqrt(np.nanmax(np.where(np.eye(3), 0.0, square))))

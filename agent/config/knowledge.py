@@ -113,7 +113,8 @@ class Certificate(Section):
     must be calibrated again; `fieldcal check` tells when it is over. `filters` and the table `response` are divided out
     of the data; left out, the filters are the driver's. `file` names a certificate of `fieldcal certificate` (JSON, or
     DCC XML) instead: the program reads it once, at the start, and fills in `sensitivity` (the mean of the three main
-    ones), its u, which covers their spread, the serial number and the date.
+    ones), its u, which covers their spread, `u_transverse_pct`, which covers the transverse ones, the serial number and
+    the date.
     """
 
     file: Annotated[str, Field(description="certificate of the reference")] = ""
@@ -121,6 +122,9 @@ class Certificate(Section):
     quantity: Annotated[str, AfterValidator(_quantity)] = "acceleration"
     sensitivity: Annotated[float, Field(gt=0, description="indication per SI unit of the quantity")] = 1.0
     u_sensitivity_pct: Annotated[float, Field(gt=0, le=50)] = 0.1
+    u_transverse_pct: Annotated[
+        float, Field(ge=0, le=20, description="of the transverse sensitivities of a tri-axial reference; 0: none")
+    ] = 0.0
     lag_s: Annotated[float, Field(ge=-0.1, le=0.1, description="by which its indications come late")] = 0.0
     u_lag_s: Annotated[float, Field(ge=0, le=0.1, description="0: the lag is found from the data alone")] = 0.0
     noise_mps2: Annotated[float, Field(ge=0, description="rms, in SI units of the quantity; 0: as the data show")] = 0.0
@@ -275,6 +279,7 @@ PRIORS: Mapping[str, Setting] = {
     "offset_position_mps2": Setting(("uncertainty.offset_position_mps2",)),
     "gravity_mps2": Setting(("uncertainty.gravity_mps2",)),
     "reference": Setting(("certificate.u_sensitivity_pct",), from_percent),
+    "reference_transverse": Setting(("certificate.u_transverse_pct",), from_percent),
     "reference_drift": Setting(("certificate.stability_pct",), from_percent),
     "reference_per_k": Setting(("certificate.u_sensitivity_pct_per_k",), from_percent),
     "reference_corner_hz": Setting(("certificate.u_corner_hz",)),

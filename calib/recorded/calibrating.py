@@ -56,7 +56,11 @@ def _estimated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
         return _plain(tables_of(sensor, reference, poses, options), priors_of(options))
     certificate = options.reference_certificate
     if certificate is not None:
-        options = replace(options, u_reference_pct=100.0 * float(np.max(certificate.u_relative)))
+        options = replace(
+            options,
+            u_reference_pct=100.0 * float(np.max(certificate.u_relative)),
+            u_reference_transverse_pct=100.0 * certificate.u_transverse,
+        )
     tables = tables_of(sensor, reference, poses, options, instrument_of(options))
     return adjusted(tables, priors_of(options), certificate, options.band_hz)
 

@@ -33,7 +33,9 @@ STATED: Mapping[str, tuple[str, Callable[[float], float]]] = {
     "alpha_common_rad": ("u_alpha_common_deg", from_deg), "angle_rad": ("u_angle_deg", from_deg),
     "gravity_direction_rad": ("u_angle_deg", from_deg), "tilt_rad": ("u_tilt_deg", from_deg),
     "offset_position_mps2": ("u_offset_position_mps2", float), "gravity_mps2": ("u_gravity_mps2", float),
-    "reference": ("u_reference_pct", from_percent), "reference_corner_hz": ("u_reference_corner_hz", float),
+    "reference": ("u_reference_pct", from_percent),
+    "reference_transverse": ("u_reference_transverse_pct", from_percent),
+    "reference_corner_hz": ("u_reference_corner_hz", float),
     "reference_corner_at_hz": ("reference_corner_hz", float), "rotation_rad": ("u_rotation_deg", from_deg),
     "transverse": ("u_transverse_motion_pct", from_percent), "offset_mps2": ("u_offset_mps2", float),
     "reference_frequency_hz": ("reference_frequency_hz", float),
@@ -48,7 +50,7 @@ class Options:
     (calib.signal.known_filters); empty where nobody states any. `band_hz`: both ends of the band to which sensor and
     reference are limited. `rotation` (3, 3): a = R a_ref. `prior`: S row by row
     and Q (12,), and their covariance (12, 12), see calib.recorded.priors.prior_of. The u of `reference_certificate`
-    counts in the place of `u_reference_pct`.
+    count in the place of `u_reference_pct` and `u_reference_transverse_pct`.
     """
 
     method: int = 3
@@ -78,6 +80,7 @@ class Options:
     u_offset_mps2: float = 0.05
     u_offset_position_mps2: float = 0.0
     u_reference_pct: float = 0.1
+    u_reference_transverse_pct: float = 0.0
     u_transverse_motion_pct: float = 1.0
     u_tilt_deg: float = 0.0
     u_rotation_deg: float = 0.2

@@ -30,7 +30,7 @@ STATED = Knowledge(
     prior=Prior(sensitivity=1.0, corner_hz=0.2, u_corner_hz=0.03, reference_frequency_hz=4.0),
     certificate=Certificate(
         u_sensitivity_pct=0.7, lag_s=0.003, u_lag_s=0.0003, corner_hz=0.1, u_corner_hz=0.02, stability_pct=0.6,
-        u_sensitivity_pct_per_k=0.03,
+        u_sensitivity_pct_per_k=0.03, u_transverse_pct=1.3,
     ),
     uncertainty=Uncertainty(
         angle_deg=1.0, theta_deg=2.0, theta_position_deg=3.0, alpha_common_deg=4.0, rotation_deg=5.0, tilt_deg=6.0,
@@ -46,7 +46,7 @@ OF_THE_CONFIGURATION = {
     "angle_rad": DEG, "theta_rad": 2 * DEG, "theta_position_rad": 3 * DEG, "alpha_common_rad": 4 * DEG,
     "rotation_rad": 5 * DEG, "transverse": 0.07, "offset_mps2": 0.08, "offset_position_mps2": 0.09,
     "gravity_mps2": 0.01, "lag_s": 0.0005, "lag_at_s": -0.003, "lag_window_s": 0.0011, "reference": 0.007,
-    "reference_drift": 0.006, "reference_per_k": 3e-4, "reference_corner_at_hz": 0.1,
+    "reference_transverse": 0.013, "reference_drift": 0.006, "reference_per_k": 3e-4, "reference_corner_at_hz": 0.1,
     "reference_corner_hz": 0.02, "sensor_corner_at_hz": 0.2, "sensor_corner_hz": 0.03, "reference_frequency_hz": 4.0,
 }  # fmt: skip
 AT_A_FIXED_MOUNT = {"gravity_direction_rad": 6 * DEG, "lean_rad": 6 * DEG, "tilt_rad": 0.0}
@@ -60,6 +60,7 @@ OF_THE_OPTIONS = {
     "u_offset_mps2": (0.08, {"offset_mps2": 0.08}),
     "u_offset_position_mps2": (0.09, {"offset_position_mps2": 0.09}),
     "u_reference_pct": (0.7, {"reference": 0.007}),
+    "u_reference_transverse_pct": (1.3, {"reference_transverse": 0.013}),
     "u_transverse_motion_pct": (7.0, {"transverse": 0.07}),
     "u_tilt_deg": (6.0, {"tilt_rad": 6 * DEG}),
     "u_rotation_deg": (5.0, {"rotation_rad": 5 * DEG}),
