@@ -32,7 +32,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "s": ("ms", 1e3),
     "1/K": ("%/K", 100.0),
 }
-WORTH = 3.0  # an explanation that makes chi-squared smaller by less explains nothing
+WORTH = 3.0  # an explanation that makes what chi-squared has beyond chance smaller by less explains nothing
 
 COMPARE = "Compare devices and mount with the configuration"
 NOT_AGREED = "no estimate can be put in force, since the windows do not agree on one change yet"
@@ -69,10 +69,13 @@ def explained(
     """
     limit, fixed_mount = gate.limit, channel.fixed_mount
     alone = state.chi2_beside(held)
-    before = state.after(held, {}).chi2 - alone
-    sound = limit(sum(record.rows for record in held))
+    before, by_chance = state.after(held, {}).chi2 - alone, sum(record.rows for record in held)
+    sound = limit(by_chance)
     said = (
         f"{len(held)} held windows contradict the state: chi-squared {before:.0f}, {sound:.0f} at most if it is right."
+        if before > sound
+        else f"{len(held)} held windows agree with what the state may have become since its last window (chi-squared "
+        f"{before:.0f}, {sound:.0f} at most)."
     )
     found = sorted(
         (
@@ -81,8 +84,10 @@ def explained(
         ),
         key=lambda e: e.score,
     )
-    if not found or before < WORTH * found[0].chi2:
-        return f"{said} No known explanation fits them. {COMPARE}"
+    left = found[0].chi2 - by_chance if found else before
+    if not found or before < found[0].score + DECISIVE or before - by_chance < WORTH * left:
+        accept = "" if number is None or before > sound else f", or {_accepting(number)}"
+        return f"{said} No known explanation fits them better. {COMPARE}{accept}"
     # Of those that fit alike, the one with the fewest unknowns: a mount that turned is also a change of all S.
     best = min((e for e in found if e.score < found[0].score + DECISIVE), key=lambda e: len(e.members))
     fits = "Best fits" if best.chi2 <= sound else "Nearest, though not within what chance allows, is"
@@ -95,8 +100,7 @@ def explained(
     ]
     others = f" As well fits: {'; '.join(alike)}." if alike else ""
     return (
-        f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}, {before / best.chi2:.3g} times "
-        f"smaller.{others} "
+        f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}.{others} "
         f"{_remedy(best, state.scale, channel, number) if helps else best.unfit or COMPARE}"
     )
 
@@ -163,7 +167,7 @@ def _remedy(best: Explanation, scale: float, channel: Channel, number: int | Non
     kind, fixed_mount = best.most.kind, channel.fixed_mount
     accept = best.unfit or NOT_AGREED
     if number is not None and not best.unfit:
-        accept = f"put the change in force: fieldcal command accept --sequence {number}"
+        accept = _accepting(number)
     if kind is OFFSET and fixed_mount:
         lean_deg = np.rad2deg(abs(best.change) / (scale * STANDARD_GRAVITY_MPS2))
         return f"A mount that leans by {lean_deg:.2g} deg does the same: level it. Otherwise: {accept}"
@@ -180,6 +184,10 @@ def _remedy(best: Explanation, scale: float, channel: Channel, number: int | Non
     settings = [field for field in setting.fields if _may_be(channel, field, float(least))]
     wider = f", or set {' or '.join(settings)} to {least} or more" if settings else ""
     return f"Correct it in the configuration{wider}"
+
+
+def _accepting(number: int) -> str:
+    return f"put the change in force: fieldcal command accept --sequence {number}"
 
 
 def _may_be(channel: Channel, setting: str, value: float) -> bool:
