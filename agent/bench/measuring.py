@@ -76,9 +76,8 @@ class Measuring:
         applied = Applied.of(self.priors, 0.0)
 
         def lag_of(windows: Sequence[Window], lag_s: float) -> float:
-            return (
-                adjust(_used(windows), with_response(self.priors, windows), replace(applied, lag_s=lag_s)).lag_s or 0.0
-            )
+            priors = with_response(self.priors, windows)
+            return adjust(_used(windows), priors, replace(applied, lag_s=lag_s)).common_lag_s or 0.0
 
         windows, self.lag_s = without_lag(self.lag_s, self._tables(record, taken).windows, _used, lag_of)
         return windows

@@ -83,6 +83,8 @@ class Adjustment:
     known of S and Q makes it the posterior. `contributions` {source: (12,) standard
     uncertainties} is the budget. `grounds`: what `reasons` is found from. `rank` of the input vectors, 4 at most.
     `offset_scatter_mps2`, `slope_scatter` (relative) and `lag_scatter_s`: between windows, as estimated.
+    `common_lag_s`: the lag as it was before the windows were given lags of their own, None where it is no unknown: from
+    a start that is far off they seem to differ, and the lag would not be found.
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
     standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
     blanked. `response`: over frequency; None where it is no unknown. `share`: what S and Q owe to the reference.
@@ -101,6 +103,7 @@ class Adjustment:
     lag_scatter_s: float
     misfit: float
     nuisance_pull: float
+    common_lag_s: float | None
     mean: Array
     covariance: Array
     response: ResponseTold | None
@@ -173,6 +176,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     held = [e.pose for e in found]
     solution = solve(Equations(data, held, priors, applied, scatter, ways), priors)
+    common_lag_s = _lag_s(solution)
     for _ in range(SCATTER_TURNS if priors.lag_s > 0.0 else 0):
         larger = estimated(scatter, *slope_residuals(solution), data.type_a.slopes)
         if larger.lag_s.max() <= (1.0 + SCATTER_SETTLED) * scatter.lag_s.max():
@@ -208,6 +212,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         lag_scatter_s=float(scatter.lag_s.max()),
         misfit=misfit(solution),
         nuisance_pull=nuisance_pull(solution, shares.covariance)[0],
+        common_lag_s=common_lag_s,
         mean=solution.x,
         covariance=shares.covariance,
         response=_response(solution, shares.covariance, priors, used, k),
@@ -258,6 +263,11 @@ def _without_offset(priors: Priors) -> Priors:
     covariance[9:, :], covariance[:, 9:] = 0.0, 0.0
     covariance[range(9, 12), range(9, 12)] = np.inf
     return replace(priors, covariance=covariance)
+
+
+def _lag_s(solution: Solution) -> float | None:
+    terms = zip(solution.equations.nuisances.terms, solution.x[12:], strict=True)
+    return next((float(value) + term.applied for term, value in terms if term.kind is LAG), None)
 
 
 def _reported(solution: Solution, shares: Budget) -> tuple[Nuisance, ...]:

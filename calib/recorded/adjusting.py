@@ -36,6 +36,10 @@ from calib.signal.stamps import clock_from_stamps
 
 METHOD = "3 (adjustment)"
 LAG_SD, LAG_PERIODS = 3.0, 3.0  # how far a lag is searched: stated standard uncertainties, periods of the motion
+# Windows of one frequency that differ by more, as SD over S, are tried with other lags (over a period), but none near a
+# half, where S has the other sign. From MOST_PHASE_RAD on they are refused: S is smaller by half of its square.
+ALIKE, OTHER_LAGS = 0.03, (1 / 12, -1 / 12, 1 / 6, -1 / 6, 1 / 4, -1 / 4)
+MOST_PHASE_RAD = 0.1
 LEAST_USED = 0.05  # of the points in motion
 MAIN = [0, 4, 8]  # of PARAMETERS
 HALF_OCTAVE = 2.0**0.5
@@ -129,9 +133,50 @@ def _repeated(outcome: Outcome, tables: Tables, priors: Priors, band_hz: Band) -
 
 def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN_BANDS) -> _Told:
     """Make windows with the lag and the response over frequency taken out, and adjust them. Bands may deviate from one
-    response by `most_between`."""
+    response by `most_between`.
+
+    Where all motion has one frequency, each window of it fits several lags, each with another S. Where windows then
+    differ from each other, the search may have led to a lag that not all of them fit, and begins anew at others.
+    """
+    told = _searched(tables, priors, most_between, priors.lag_at_s)
+    found = told.found
+    if found is None or found.response is None or not found.grounds.priors.response_model.one_frequency:
+        return told
+    if _between_windows(told) > ALIKE:
+        period_s, lag_s = 1.0 / found.response.reference_frequency_hz, found.lag_s or 0.0
+        others = [_searched(tables, priors, most_between, lag_s + share * period_s) for share in OTHER_LAGS]
+        told = min((told, *others), key=lambda each: (bool(each.outcome.reasons), _between_windows(each)))
+    return told
+
+
+def _phase_scatter(found: Adjustment) -> float:
+    """SD in rad of the phase by which windows differ, at the frequency at which S holds."""
+    return 0.0 if found.response is None else 2.0 * np.pi * found.response.reference_frequency_hz * found.lag_scatter_s
+
+
+def _between_windows(told: _Told) -> float:
+    """By how much the slopes of windows differ from each other in size and phase, relative to S, as SD."""
+    return np.inf if told.found is None else float(np.hypot(_phase_scatter(told.found), told.found.slope_scatter))
+
+
+def _not_alike(found: Adjustment) -> str:
+    """Why windows of one frequency have no S and no lag in common; "" where they have, and of other motion."""
+    phase, size = _phase_scatter(found), found.slope_scatter
+    if not found.grounds.priors.response_model.one_frequency:
+        return ""
+    if phase <= MOST_PHASE_RAD and size <= MOST_BETWEEN_BANDS:
+        return ""
+    return (
+        f"windows of one frequency have no S and no lag in common: as SD they differ by {size:.2g} of S, limit "
+        f"{MOST_BETWEEN_BANDS:g}, and {phase:.2g} rad of phase, limit {MOST_PHASE_RAD:g}; calibrate with motion at "
+        "other frequencies too, below the corner of any filter; look for a mount that slips or a clock that jumps"
+    )
+
+
+def _searched(tables: Tables, priors: Priors, most_between: float, begin_s: float) -> _Told:
+    """What the search tells that begins at this lag in s."""
     search = _Search(tables, priors, most_between)
-    applied = search.begin()
+    applied = search.begin(begin_s)
     refused = None if _used(search.windows) else search.windows
     first: tuple[Adjustment, float] | None = None
     for turn in range(RESPONSE_TURNS):
@@ -184,12 +229,12 @@ class _Search:
         self.windows: list[Window] = []
         self._latest: tuple[Sequence[Window], Applied, Adjustment] | None = None
 
-    def begin(self) -> Applied:
-        """Make the first windows; returns what the search goes on with.
+    def begin(self, lag_s: float) -> Applied:
+        """Make the first windows, at this lag; returns what the search goes on with.
 
         If none can be used the sensor may be far too late, or a response may look like a mean that changes.
         """
-        flat = Applied(self._priors.lag_at_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
+        flat = Applied(lag_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
         applied = self.make(flat)
         if not _used(self.windows):
             applied = self.make(replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, self.windows)))
@@ -228,7 +273,7 @@ class _Search:
             return self._tables.windows(lag_s, taken.response, steady=steady)
 
         def lag_of(made: Sequence[Window], lag_s: float) -> float:
-            return self.at(made, replace(taken, lag_s=lag_s)).lag_s or 0.0
+            return self.at(made, replace(taken, lag_s=lag_s)).common_lag_s or 0.0
 
         self.windows, lag_s = without_lag(taken.lag_s, anew, _used, lag_of)
         return replace(taken, lag_s=lag_s)
@@ -294,18 +339,26 @@ def _at_rest(told: _Told, priors: Priors) -> tuple[Outcome, Adjustment | None]:
     windows do at the frequency of the motion, or contradict the motion, and nobody stated a frequency.
 
     Motion takes no part: how far S changes from its frequency down to 0 Hz is known only where rests tell S themselves.
+    Where they do not, motion that does not agree with itself is refused.
     """
     outcome, found = told.outcome, told.found
-    rests = [w for w in _used(outcome.windows) if w.kind == "rest"]
-    if outcome.reasons or found is None or found.response is None or priors.reference_frequency_hz or not rests:
+    if outcome.reasons or found is None or found.response is None:
         return outcome, found
+    rests = [w for w in _used(outcome.windows) if w.kind == "rest"]
+    if rests and not priors.reference_frequency_hz and (steady := _rests_alone(rests, found, priors)) is not None:
+        return replace(_outcome(steady, outcome.windows, outcome.rate_hz), lag_s=outcome.lag_s), steady
+    if reason := _not_alike(found):
+        return replace(outcome, calibration=None, reasons=(reason,)), found
+    return outcome, found
+
+
+def _rests_alone(rests: Sequence[Window], found: Adjustment, priors: Priors) -> Adjustment | None:
+    """The adjustment of rests, where they tell S instead of the motion (see `_at_rest`)."""
     steady = adjust(rests, priors, found.grounds.applied)
     u, u_at_rest = (np.nan_to_num(a.calibration.standard_uncertainty[MAIN], nan=np.inf) for a in (found, steady))
     lost = found.calibration.determined & ~steady.calibration.determined
-    alone = BETTER * np.max(u) > np.max(u_at_rest) or _contradicts_rests(found)
-    if lost.any() or not alone or steady.reasons:
-        return outcome, found
-    return replace(_outcome(steady, outcome.windows, outcome.rate_hz), lag_s=outcome.lag_s), steady
+    alone = BETTER * np.max(u) > np.max(u_at_rest) or _contradicts_rests(found) or _not_alike(found)
+    return steady if alone and not lost.any() and not steady.reasons else None
 
 
 def _contradicts_rests(found: Adjustment) -> bool:

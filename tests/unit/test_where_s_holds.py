@@ -71,6 +71,39 @@ def test_s_at_0_hz_is_told_by_rests_alone(
     assert "S holds at 0 Hz, told by rests alone" in found.where_it_holds
 
 
+@pytest.mark.parametrize(
+    ("response", "shaken_mps2"),
+    [(lowpass(1, 22.4), 2.8), (lowpass(2, 11.1), 1.0), (lowpass(1, 24.0), 0.21), (lowpass(2, 25.4), 0.87)],
+)
+def test_one_tone_in_all_stays_tells_s_at_its_frequency(response: Filter, shaken_mps2: float) -> None:
+    """Each window of a tone on an ellipse fits several lags, each with another S. The search gave each window a lag of
+    its own before it had found the common one, and S was 7 to 24 u off and valid in each of these."""
+    found, S = turned_by_hand(response, shaken_mps2, 1)
+    assert found.status == "valid", found.reasons
+    at_hz = found.reference_frequency_hz
+    assert at_hz == pytest.approx(TONE_HZ, abs=0.02)
+    away = np.abs(found.sensitivity - S * abs(response(np.array([TONE_HZ]))[0])).ravel()
+    assert np.all(away < 4.0 * found.standard_uncertainty[:9])
+
+
+def test_windows_of_one_frequency_without_a_common_lag_are_refused() -> None:
+    """Far above the corner a tone leaves little to tell its lag from: S was 27 u off, and valid."""
+    found, _ = turned_by_hand(lowpass(3, 7.3), 0.11, 1)
+    assert found.status == "refused"
+    assert "have no S and no lag in common" in found.reasons[0]
+
+
+def test_two_tones_tell_s_at_their_mean_frequency_by_power() -> None:
+    """Three axes of two tones have four independent parts, with their derivatives: what one part alone tells of the
+    frequency may lie far outside of them (here 10.3 Hz)."""
+    random = np.random.default_rng(37)
+    t = np.arange(6000) / RATE_HZ
+    a = sum(1.5 * np.sin(2.0 * np.pi * hz * t[:, None] + random.uniform(0.0, 6.28, 3)) for hz in (6.4, 8.3))
+    V, u = (x + 0.02 * random.normal(size=a.shape) for x in (a, a))
+    found = calibrate((t, V), {"time_s": t, "ax": u[:, 0], "ay": u[:, 1], "az": u[:, 2]}, rotation=np.eye(3))
+    assert found.reference_frequency_hz == pytest.approx(np.sqrt((6.4**2 + 8.3**2) / 2.0), rel=0.02)
+
+
 def test_s_at_a_stated_frequency_stays_there() -> None:
     found, _ = turned_by_hand(lowpass(1, 100.0), 0.2, 5, reference_frequency_hz=TONE_HZ)
     assert found.reference_frequency_hz == TONE_HZ
