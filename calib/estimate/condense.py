@@ -114,7 +114,13 @@ def mean_frequency_hz(data: Condensed) -> float:
     power = np.sum(data.root[:, :, real] ** 2, axis=1)
     if data.bands is None or not power.any():
         return 0.0
-    return float(np.sqrt(power.sum(axis=1) @ data.omega2 / power.sum())) / (2.0 * np.pi)
+    square = -data.bands.projected[:, 0, real, real]  # by c_2, the slopes on u move by -omega^2
+    # Of few tones the derivative of one channel is mostly what other channels tell, and tells little beside them.
+    rates = [data.channels + k for k in real]
+    alone, whole = data.root[:, rates, rates] ** 2, np.sum(data.root[:, :, rates] ** 2, axis=1)
+    shared = (alone < SHARED * whole).any(axis=1)
+    square[shared] = data.omega2[shared, None]
+    return float(np.sqrt(max(np.sum(power * square), 0.0) / power.sum())) / (2.0 * np.pi)
 
 
 def effective(data: Condensed, independent: Array) -> Condensed:
