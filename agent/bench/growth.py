@@ -35,10 +35,8 @@ class Growth:
     def variance_after(self, days: float) -> Array:
         """(12,) of S and Q, in the squares of their units."""
         c, scale = self.channel, scale_of(self.sensitivity.ravel())
-        walk = c.wander().variance_a_day(scale, c.gravity_mps2)
-        p, t = c.process, c.temperature
-        grown = walk * days
-        grown[9:] += (scale * p.offset_rate_mps2 * days) ** 2 + (scale * p.offset_rate_walk_mps2) ** 2 * days**3 / 3.0
+        t, u_rate = c.temperature, np.full(3, scale * c.process.offset_rate_mps2)
+        grown = c.wander().variance_after(days, scale, c.gravity_mps2, u_rate)
         if days > 0.0:
             grown[:9] += (t.u_sensitivity_pct_per_k / 100.0 * self.off_k * self.sensitivity.ravel()) ** 2
             grown[9:] += (scale * t.u_offset_mps2_per_k * self.off_k) ** 2

@@ -26,18 +26,20 @@ class ChannelPlan:
     """The plan of one channel; `plan` is None where there is none.
 
     `faults`: why no first calibration comes of it. `unplaced`: that no position is stated, as for `fieldcal bench`.
+    `watched`: which calibration is in force where the sensor has neither reference nor position; else "".
     """
 
     sensor: str
     plan: Planned | None = None
     faults: tuple[Told, ...] = ()
     unplaced: tuple[Told, ...] = ()
+    watched: str = ""
 
     @property
     def told(self) -> str:
-        """The plan in a line; "" where there is none."""
+        """The plan in a line, or that the sensor is watched; "" where there is neither."""
         if self.plan is None:
-            return ""
+            return self.watched
         main, transverse, offset = self._worst(self.plan)
         rest = f" ({', '.join(self.plan.missing)} stay as the prior states them)" if self.plan.missing else ""
         return (
@@ -85,6 +87,8 @@ def _plans(config: Config, options: Mapping[str, Options]) -> list[ChannelPlan]:
 
 
 def _plan_of(i: int, channel: Channel, nominal: float | None, config: Config) -> ChannelPlan:
+    if channel.watched:
+        return ChannelPlan(channel.sensor, watched=_watched(channel))
     if not states_positions(channel):
         told = channel.positions == "free" or _may_be_turned(config, channel)
         return ChannelPlan(channel.sensor, unplaced=() if told else (_no_position(i, channel),))
@@ -105,11 +109,17 @@ def _plan_of(i: int, channel: Channel, nominal: float | None, config: Config) ->
     return ChannelPlan(channel.sensor, found, ((("channels", i, place), f"{what}; {_remedy(channel, nominal)}"),))
 
 
+def _watched(channel: Channel) -> str:
+    dated = f"in force is that of {channel.prior.calibrated}, and its U grows from then on"
+    undated = "in force is what an earlier run has kept; state that of a visit in prior.file and prior.calibrated"
+    return f"{channel.sensor}: no reference: watched; {dated if channel.prior.calibrated else undated}"
+
+
 def _no_position(i: int, channel: Channel) -> Told:
-    beside = "" if channel.reference is None else ", or rotation beside a reference with three axes"
     return ("channels", i), (
         f"no position of {channel.sensor} is stated, so that `fieldcal run` cannot calibrate it; state poses (with "
-        f"times) or positions{beside}; only `fieldcal bench` and `fieldcal visit` need none"
+        "times) or positions, or rotation beside a reference with three axes; only `fieldcal bench` and `fieldcal "
+        "visit` need none"
     )
 
 

@@ -44,7 +44,7 @@ def check(config: Path, json_to: str | None) -> int:
     `positions` (their numbers), `filters` (of each sensor and reference: `sensor` of the channel, `device`,
     `lines`, `stated_by`), and `plans` (of each channel with positions: `sensor`, how many parameters are `determined`,
     how many are `needed`, which are `missing`, and U in `expanded_u_main_pct`, `expanded_u_transverse_pct`,
-    `expanded_u_offset_mps2`).
+    `expanded_u_offset_mps2`), and `watched` (names of the sensors without a reference and positions).
     """
     try:
         raw, text = read_toml(config)
@@ -72,8 +72,9 @@ def check(config: Path, json_to: str | None) -> int:
     }
     filters = list(stated_filters(loaded))
     if json_to:
+        watched = [one.sensor for one in plans if one.watched]
         plans_json = [one.json for one in plans if one.plan is not None]
-        more = {**counts, "filters": [asdict(one) for one in filters], "plans": plans_json}
+        more = {**counts, "filters": [asdict(one) for one in filters], "plans": plans_json, "watched": watched}
         click.echo(json.dumps({"good": not doubts, "faults": [], "warnings": warnings, **more}))
         return 0
     for warning in warnings:
@@ -83,7 +84,7 @@ def check(config: Path, json_to: str | None) -> int:
     verdict = "no fault, but what is told of it must be right before `fieldcal run` can calibrate" if doubts else "good"
     say(f"{config}: {verdict}; {', '.join(told)}{found}")
     answered = [a.says for a in answers if a.verdict == "good"]
-    planned = [one.told for one in plans if one.plan is not None]
+    planned = [one.told for one in plans if one.told]
     for line in dict.fromkeys([*planned, *(one.told for one in filters), *answered]):
         say(f"  {line}")
     return 0

@@ -69,7 +69,7 @@ def _says(key: str, found: Mapping[str, Any]) -> bool:
 
 
 def _prior(path: FilePath) -> dict[str, Any]:
-    """S, Q and their u; Q only where the file knows it. Raises EarlierError."""
+    """S, Q and their u; Q and the date only where the file knows them. Raises EarlierError, OSError."""
     values, covariance = read_earlier(path)
     with np.errstate(invalid="ignore"):
         u = np.sqrt(np.diag(covariance))
@@ -79,6 +79,8 @@ def _prior(path: FilePath) -> dict[str, Any]:
             "state sensitivity, u_main_pct and u_transverse_pct instead of file"
         )
     found: dict[str, Any] = {"sensitivity": values[:9].tolist(), "u_sensitivity": u[:9].tolist()}
+    if calibrated := identity_in(path)[1]:
+        found["calibrated"] = calibrated
     if np.isfinite(values[9:]).all() and (u[9:] > 0.0).all():
         scale = scale_of(values)
         found |= {"offset_mps2": (values[9:] / scale).tolist(), "u_offset_mps2": (u[9:] / scale).tolist()}

@@ -54,6 +54,7 @@ class Channel(Knowledge):
     """One sensor with its reference and its geometry."""
 
     sensor: Name
+    # Left out, with neither poses nor positions: the sensor is watched, and keeps the calibration that it has.
     reference: Name | None = None
     check_reference: CheckReference | None = None
     coupling: Literal["dc", "ac"] = "dc"
@@ -98,6 +99,11 @@ class Channel(Knowledge):
     def fixed_mount(self) -> bool:
         """Whether the sensor is never turned against gravity. Its mean output then gives no information on S."""
         return self.rotation is not None or len(self.poses) == 1
+
+    @property
+    def watched(self) -> bool:
+        """Whether neither a reference nor a stated position can calibrate the sensor: it is recorded and watched."""
+        return self.reference is None and not self.poses and not self.positions
 
     @property
     def by_reference(self) -> list[Channel]:

@@ -34,6 +34,24 @@ PositiveVector = tuple[Positive, Positive, Positive]
 Sha256 = Annotated[str, Field(pattern="^([0-9a-f]{64})?$", description="of `file`; if stated, the file must have it")]
 
 
+def iso_date(value: object) -> str:
+    """A date in ISO form from the text, or from the date that TOML knows; "" is no date."""
+    if isinstance(value, datetime):
+        raise ValueError("must be a date without a time, as in 2026-03-01")
+    try:
+        return date.fromisoformat(str(value)).isoformat() if value != "" else ""
+    except ValueError:
+        raise ValueError("must be a date: year, month and day, as in 2026-03-01") from None
+
+
+IsoDate = Annotated[str, BeforeValidator(iso_date)]
+
+
+def midnight(stated: str) -> datetime | None:
+    """Midnight UTC of a date in ISO form; None of ""."""
+    return datetime.fromisoformat(stated).replace(tzinfo=UTC) if stated else None
+
+
 class Prior(Section):
     """S and Q of the sensor before any data, from its certificate or data sheet; the agent does not start without.
 
@@ -43,7 +61,8 @@ class Prior(Section):
     known ones of the sensor; left out, they are the driver's. S holds at `reference_frequency_hz`; 0 takes the middle
     of the band of the first windows. `file` names an earlier result or a certificate of `fieldcal certificate` (JSON,
     or DCC XML) instead: the program reads it once, at the start, and fills in `sensitivity`, `u_sensitivity`, and the
-    offset where the file knows it.
+    offset where the file knows it; of a certificate also `calibrated`, the date of this calibration. With a date it is
+    in force at a sensor without a reference, and its U grows from then on.
     """
 
     file: Annotated[str, Field(description="result or certificate that states S and Q")] = ""
@@ -60,6 +79,12 @@ class Prior(Section):
     u_corner_hz: NotNegative = 0.0
     filters: Filters = ()
     reference_frequency_hz: NotNegative = 0.0
+    calibrated: IsoDate = ""
+
+    @property
+    def date(self) -> datetime | None:
+        """The date `calibrated`, midnight UTC; None where it is not stated."""
+        return midnight(self.calibrated)
 
     def with_filters(self, stated: tuple[str, ...]) -> Prior:
         """The prior with the filters and the corner that the sensor's driver states, where it states none itself."""
@@ -90,19 +115,6 @@ def _quantity(name: str) -> str:
     if name not in QUANTITIES:
         raise ValueError(f"must be one of {', '.join(QUANTITIES)}")
     return name
-
-
-def iso_date(value: object) -> str:
-    """A date in ISO form from the text, or from the date that TOML knows; "" is no date."""
-    if isinstance(value, datetime):
-        raise ValueError("must be a date without a time, as in 2026-03-01")
-    try:
-        return date.fromisoformat(str(value)).isoformat() if value != "" else ""
-    except ValueError:
-        raise ValueError("must be a date: year, month and day, as in 2026-03-01") from None
-
-
-IsoDate = Annotated[str, BeforeValidator(iso_date)]
 
 
 class Certificate(Section):
@@ -162,7 +174,7 @@ class Certificate(Section):
     @property
     def date(self) -> datetime | None:
         """The date `calibrated`, midnight UTC; None where it is not stated."""
-        return datetime.fromisoformat(self.calibrated).replace(tzinfo=UTC) if self.calibrated else None
+        return midnight(self.calibrated)
 
     @cached_property
     def sha256(self) -> str:

@@ -31,7 +31,19 @@ from agent.core.outcome import (
 from agent.core.references import References
 from agent.core.run_time import RunTime
 from agent.core.streams import Streams, Verdict
+from agent.core.watch import Hour, Watch
+from agent.core.watched import (
+    DAY_NS,
+    NOT_CALIBRATED,
+    WATCHED,
+    aged,
+    date_utc_ns,
+    in_force_since,
+    is_newer,
+    watch_report,
+)
 from agent.core.windows import refused
+from calib.estimate.correction import Law
 from calib.model import Calibration, Pose, Window
 from hw.block import SampleBlock
 
@@ -60,6 +72,7 @@ class ChannelState:
         self._status = ""  # no status was published yet
         self._refused = 0  # how many windows in a row were refused
         self._clocks, self._time = Clocks(), RunTime()
+        self._watched = Watch() if channel.watched else None
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
         """Begin a new run. Seconds count from `origin_ns`. `kept`: a state (`memory`) for each identity of a sensor."""
@@ -85,13 +98,21 @@ class ChannelState:
             self._streams.look_where(block, self._estimation)
             taken = self._streams.by_device[self.sensor], self._time.origin_utc_ns
             suspect = self._streams.suspect(block.device)
-            results += accelerations(block, *taken, self._channel, self._estimation, self._in_force, suspect)
+            law = self._law(self._estimation)
+            of = self._channel, law, self._estimation.residual_sd, self._in_force
+            results += accelerations(block, *taken, *of, suspect)
+            if self._watched is not None:
+                results += self._end_hour(self._watched.update(block, suspect, law))
         return results + list(self._close_windows()) + self._clock_reports()
 
     def on_tick(self, tick: Tick) -> list[Result]:
         """Time passed: windows whose samples come too late are refused; a sensor without data becomes INVALID."""
         self._time.update(tick.t_monotonic_ns, tick.t_utc_ns)
-        return list(self._close_windows()) + self._watch_silence() + self._explain() + self._clock_reports()
+        results = list(self._close_windows()) + self._watch_silence() + self._explain() + self._clock_reports()
+        if self._watched is not None and self._estimation is not None:
+            late_s, law = self._channel.late_horizon_s, self._law(self._estimation)
+            results += self._end_hour(self._watched.tick(self._time.utc_ns, late_s, law))
+        return results
 
     def on_device(self, change: DeviceChange) -> list[Result]:
         """A device of this channel was opened or lost."""
@@ -140,6 +161,7 @@ class ChannelState:
             if self._estimation is not None:
                 self._kept = shelved(self._kept, self.identity, self.memory())
                 self._streams.forget_sensor()
+                self._watched = None if self._watched is None else Watch()
                 belongs, self._estimation = "", None
                 reason = f"{self.sensor} is another device now: {identity} instead of {self.identity}"
             known_as = kept_as(self._kept, identity, device_of(info))
@@ -157,6 +179,9 @@ class ChannelState:
                 found, reason = self._remember(self._kept.pop(known_as))
                 results += found
             results += self._meet_references()
+            if self._watched is not None:
+                results += self._believe()
+                reason += f"; {NOT_CALIBRATED if self._in_force is None else WATCHED}"
         else:
             results += self._hear_filters(self.sensor, info)
         if self._status == "INVALID":
@@ -286,6 +311,37 @@ class ChannelState:
         state, shares = self._estimation.state, self._estimation.shares_of(calibration)
         return calibration_update(self._source(), calibration, state, shares, self._references.certificate_of)
 
+    # --- without a reference
+
+    def _law(self, estimation: Estimation) -> Law:
+        """S and Q in force over temperature. Without a reference U grows as the configured walks say."""
+        if self._watched is None or self._in_force is None:
+            return estimation.law
+        return aged(estimation.law, self._channel, self._in_force, self._time.utc_ns)
+
+    def _believe(self) -> list[Result]:
+        """Put the calibration that the configuration states with its date in force, unless a newer one is."""
+        assert self._estimation is not None
+        stated = Estimation(self._filters.channel, self._nominal)
+        if not is_newer(self._channel, stated.in_force, self._in_force):
+            return []
+        self._estimation = stated
+        self._estimation.believe()
+        made = date_utc_ns(self._channel)
+        self._in_force = msgspec.structs.replace(self._update(self._estimation.in_force), made_utc_ns=made)
+        return [self._in_force]
+
+    def _end_hour(self, hour: Hour | None) -> list[Result]:
+        """The result of an hour, before it once a day the calibration in force with its present U."""
+        if hour is None or self._estimation is None:
+            return []
+        law, results = self._law(self._estimation), list[Result]()
+        if self._in_force is not None and self._time.utc_ns // DAY_NS > self._in_force.t_utc_ns // DAY_NS:
+            now = in_force_since(self._in_force, law, self._source())
+            self._in_force = now
+            results.append(now)
+        return [*results, watch_report(self._source(), hour, self._in_force, law)]
+
     def number(self, results: Sequence[Result]) -> None:
         """Take the numbers that the results got, so that the calibration in force and waiting estimates have theirs."""
         for result in results:
@@ -346,6 +402,7 @@ class ChannelState:
             "first_day": self._first_day,
             "status": self._status,
             "refused": self._refused,
+            "watch": None if self._watched is None else self._watched.snapshot(),
             **self._clocks.snapshot(),
         }
 
@@ -365,3 +422,5 @@ class ChannelState:
         self._kept = dict(state["kept"])
         self._first_day, self._status, self._refused = state["first_day"], state["status"], state["refused"]
         self._clocks.load(state)
+        if self._watched is not None and (watch := state.get("watch")) is not None:  # earlier states have none
+            self._watched.load(watch)

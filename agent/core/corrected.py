@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config import Channel
-from agent.core.estimation import Estimation
 from agent.core.events import Acceleration, CalibrationUpdate
 from agent.core.stream import DeviceStream
-from calib.estimate.correction import corrected
+from calib.estimate.correction import Law, corrected
+from calib.model import Array
 from hw.block import SampleBlock
 
 
@@ -18,20 +18,22 @@ def accelerations(
     stream: DeviceStream,
     origin_utc_ns: int,
     channel: Channel,
-    estimation: Estimation,
+    law: Law,
+    residual_sd: Array,
     in_force: CalibrationUpdate | None,
     suspect: NDArray[np.bool_],
 ) -> list[Acceleration]:
     """A block as accelerations in m/s2; empty if the channel has none, the block not three axes, or S no inverse.
 
-    `stream` gives the sample times, `origin_utc_ns` is UTC at its origin. If `in_force` is None, the prior is used.
+    `stream` gives the sample times, `origin_utc_ns` is UTC at its origin. `law`: S and Q over temperature, those of the
+    prior if `in_force` is None. `residual_sd` (3,): of single samples, output unit.
     `suspect` (3,): outputs of which samples in the block are wrong.
     """
     if channel.acceleration == "off" or block.indications.shape[1] != 3 or not block.n:
         return []
-    degc, law = float("nan") if block.temperature_degc is None else block.temperature_degc, estimation.law
+    degc = float("nan") if block.temperature_degc is None else block.temperature_degc
     try:
-        found = corrected(np.asarray(block.indications, dtype=np.float64), law.at(degc), estimation.residual_sd)
+        found = corrected(np.asarray(block.indications, dtype=np.float64), law.at(degc), residual_sd)
     except np.linalg.LinAlgError:
         return []
     first_s, rate_hz = stream.taken_at(block.first_index)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from agent.config import Channel
+from agent.config.knowledge import Prior
 from agent.core.exchanges import Explained, exchanged, explanation
 from agent.core.explaining import explained, most_likely
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
@@ -33,6 +34,7 @@ from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums, own_
 from calib.signal.response import Response
 
 DAY_S = 86400.0
+STATED = "stated by the configuration"  # the method of a calibration that it states with its date
 SAME_BUDGET = 1e-9  # of a variance: to which the squares of a budget add up
 NEAR = 0.1  # of its largest element, to which S is about another one
 SAME = 1e-6  # standard uncertainties: what rounding moves when the windows are taken again
@@ -355,6 +357,16 @@ class Estimation:
             self.state.put(calibration, day)
             self._forget()
         self._put_in_force(calibration)
+
+    def believe(self) -> None:
+        """The prior is an earlier calibration of the sensor, and is in force. Nothing is known of Q where nothing is
+        stated of it."""
+        unknown = Prior.model_fields["u_offset_mps2"].default
+        told_Q = np.broadcast_to(self._channel.prior.u_offset_mps2, 3) < unknown
+        told = np.append(np.ones(9, dtype=bool), told_Q)
+        stated = replace(self.in_force, determined=told, method=STATED)
+        self.gate.believe(stated)
+        self._put_in_force(stated)
 
     def _forget(self) -> None:
         """S and Q were replaced: what windows told of a drift of them before is none."""

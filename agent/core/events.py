@@ -334,6 +334,44 @@ class ClockReport(Result, frozen=True, kw_only=True):
     arrivals: int
 
 
+class WatchReport(Result, frozen=True, kw_only=True):
+    """What one hour of a sensor without a reference shows, after that hour; NaN: not known.
+
+    All is along the axes of the corrected acceleration, with the calibration in force at the end of the hour, which
+    `calibration_run_id` and `calibration_sequence` name as `CalibrationUpdate.made` (0: the prior). The hour is that of
+    UTC at the arrival of the samples. `samples` counts all of them, `duration_s` is the time that they cover; of these,
+    `stuck` and `clipped` are in blocks with a wrong output or at the end of the range; `missing` are known to lack.
+    `segments` of about a minute without such a block tell the rest. Their means give `mean_mps2`, and `mean_scatter`
+    is the standard deviation of these means over the root of their number. `noise_psd` (3,) in (m/s2)2/Hz,
+    `band_power` x, y, z and `cross_power` xy, xz, yz in (m/s2)2, one after the other, for each of the third octaves
+    `band_hz` (calib.signal.spectra). `u_main_pct` (3,): standard uncertainty of the main sensitivities in force at the
+    end of the hour. `gravity`: what the mean says beside that at the time of the calibration; "" while it says nothing.
+    """
+
+    what: ClassVar[str] = "watch"
+    routine: ClassVar[bool] = True
+
+    hour_utc_ns: int
+    duration_s: float
+    samples: int
+    stuck: int
+    clipped: int
+    missing: int
+    segments: int
+    mean_mps2: list[float]
+    mean_scatter_mps2: list[float]
+    temperature_degc: float
+    temperature_scatter_degc: float
+    noise_psd: list[float]
+    band_hz: list[float]
+    band_power: list[float]
+    cross_power: list[float]
+    calibration_run_id: str
+    calibration_sequence: int
+    u_main_pct: list[float]
+    gravity: str = ""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Acceleration:
     """A block of the corrected stream, a = S^-1 (V - Q) in m/s2, in the sensor's frame.

@@ -121,6 +121,8 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
         filters.take({**were.by_device, **filters.by_device})
         fresh = Estimation(filters.channel, nominal)
         changed = _changed(state["basis"], configured)
+        if configured.watched:
+            return _kept_without_reference(state, fresh, in_force, were.channel, filters.channel, day, t_utc_ns)
         if wrong := _made_otherwise(changed, state["basis"], configured):
             reason = f"begun again from the prior: windows were made with other settings: {', '.join(wrong)}"
             return Kept(fresh, None, day, t_utc_ns, reason)
@@ -144,6 +146,26 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
     if settled := fresh.state.settled_since(kept_state):
         reason += f"; {settled}"
     return Kept(fresh, in_force, day, t_utc_ns, reason, moved)
+
+
+def _kept_without_reference(
+    state: Mapping[str, Any],
+    fresh: Estimation,
+    in_force: CalibrationUpdate | None,
+    before: Channel,
+    channel: Channel,
+    day: float,
+    t_utc_ns: int,
+) -> Kept:
+    """The estimation as it was. What is stated now of the reference, which is away, and of a mount does not matter;
+    only other filters of the sensor make S another one."""
+    fresh.load(state["estimation"])
+    size = _size(before.model_copy(update={"certificate": channel.certificate}), channel,
+                 fresh.state.reference_frequency_hz)  # fmt: skip
+    if size is None:
+        return Kept(fresh, in_force, day, t_utc_ns, "restored from the previous run")
+    moved = fresh.restate(None, remounted=False, size=size)
+    return Kept(fresh, in_force, day, t_utc_ns, f"restored from the previous run; {OTHER_FILTERS}", moved)
 
 
 def _from_in_force(

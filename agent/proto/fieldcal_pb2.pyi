@@ -617,6 +617,62 @@ class Clock(_message.Message):
     signature: bytes
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., device: _Optional[str] = ..., role: _Optional[str] = ..., nominal_rate_hz: _Optional[float] = ..., rate_hz: _Optional[float] = ..., u_rate_hz: _Optional[float] = ..., offset_s: _Optional[float] = ..., u_offset_s: _Optional[float] = ..., jitter_s: _Optional[float] = ..., lag_s: _Optional[float] = ..., u_lag_s: _Optional[float] = ..., arrivals: _Optional[int] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
+class Watch(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "hour_utc_ns", "duration_s", "samples", "stuck", "clipped", "missing", "segments", "mean_mps2", "mean_scatter_mps2", "temperature_degc", "temperature_scatter_degc", "noise_psd", "band_hz", "band_power", "cross_power", "calibration_run_id", "calibration_sequence", "u_main_pct", "gravity", "engine", "signature")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    HOUR_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    DURATION_S_FIELD_NUMBER: _ClassVar[int]
+    SAMPLES_FIELD_NUMBER: _ClassVar[int]
+    STUCK_FIELD_NUMBER: _ClassVar[int]
+    CLIPPED_FIELD_NUMBER: _ClassVar[int]
+    MISSING_FIELD_NUMBER: _ClassVar[int]
+    SEGMENTS_FIELD_NUMBER: _ClassVar[int]
+    MEAN_MPS2_FIELD_NUMBER: _ClassVar[int]
+    MEAN_SCATTER_MPS2_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_DEGC_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_SCATTER_DEGC_FIELD_NUMBER: _ClassVar[int]
+    NOISE_PSD_FIELD_NUMBER: _ClassVar[int]
+    BAND_HZ_FIELD_NUMBER: _ClassVar[int]
+    BAND_POWER_FIELD_NUMBER: _ClassVar[int]
+    CROSS_POWER_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    U_MAIN_PCT_FIELD_NUMBER: _ClassVar[int]
+    GRAVITY_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
+    SIGNATURE_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    hour_utc_ns: int
+    duration_s: float
+    samples: int
+    stuck: int
+    clipped: int
+    missing: int
+    segments: int
+    mean_mps2: _containers.RepeatedScalarFieldContainer[float]
+    mean_scatter_mps2: _containers.RepeatedScalarFieldContainer[float]
+    temperature_degc: float
+    temperature_scatter_degc: float
+    noise_psd: _containers.RepeatedScalarFieldContainer[float]
+    band_hz: _containers.RepeatedScalarFieldContainer[float]
+    band_power: _containers.RepeatedScalarFieldContainer[float]
+    cross_power: _containers.RepeatedScalarFieldContainer[float]
+    calibration_run_id: str
+    calibration_sequence: int
+    u_main_pct: _containers.RepeatedScalarFieldContainer[float]
+    gravity: str
+    engine: str
+    signature: bytes
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., hour_utc_ns: _Optional[int] = ..., duration_s: _Optional[float] = ..., samples: _Optional[int] = ..., stuck: _Optional[int] = ..., clipped: _Optional[int] = ..., missing: _Optional[int] = ..., segments: _Optional[int] = ..., mean_mps2: _Optional[_Iterable[float]] = ..., mean_scatter_mps2: _Optional[_Iterable[float]] = ..., temperature_degc: _Optional[float] = ..., temperature_scatter_degc: _Optional[float] = ..., noise_psd: _Optional[_Iterable[float]] = ..., band_hz: _Optional[_Iterable[float]] = ..., band_power: _Optional[_Iterable[float]] = ..., cross_power: _Optional[_Iterable[float]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., u_main_pct: _Optional[_Iterable[float]] = ..., gravity: _Optional[str] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
+
 class Acceleration(_message.Message):
     __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only", "suspect")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]

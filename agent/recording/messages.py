@@ -148,14 +148,18 @@ def _decode_event(data: bytes) -> tuple[int, Event]:
 
 
 def _values(message: Message) -> dict[str, Any]:
-    """Fields of a message as Python values, maps by key; what is optional and absent is left out."""
+    """Fields of a message as Python values, maps by key, numbers in lists; what is optional and absent is left out."""
     values: dict[str, Any] = {}
     for field in message.DESCRIPTOR.fields:
         if field.has_presence and not message.HasField(field.name):
             continue
         value = getattr(message, field.name)
         is_map = field.message_type is not None and field.message_type.GetOptions().map_entry
-        values[field.name] = dict(sorted(value.items())) if is_map else value
+        if is_map:
+            value = dict(sorted(value.items()))
+        elif field.is_repeated and field.message_type is None:
+            value = list(value)
+        values[field.name] = value
     return values
 
 

@@ -118,6 +118,8 @@ class Guide:
                 f"check that mount, sensor and reference are as before; {channel.gate.confirm_windows} windows that "
                 f"agree confirm a change, {channel.gate.dismiss_windows} that fit the calibration end HELD"
             )
+        if channel.watched and not self._turns_itself:
+            return self._watch(seen)
         if seen.refused >= REFUSED_IN_A_ROW:
             return _mend(seen)
         if seen.status == "RECALIBRATING":
@@ -131,6 +133,16 @@ class Guide:
             return "estimates wait for an operator: enable [commands] in the configuration to accept one, and restart"
         command = f"fieldcal command accept --sensor {channel.sensor} --sequence {estimate}"
         return f"if this change is real: `{command}`; if not, check mount and reference"
+
+    @staticmethod
+    def _watch(seen: Seen) -> str:
+        """Without a reference nothing calibrates the sensor here."""
+        if seen.status == "VALID":
+            return "nothing has to be done; without a reference U grows until the next visit (`fieldcal visit`)"
+        return (
+            "calibrate it at a bench or by a visit (`fieldcal bench`, `fieldcal visit`), and state its result in "
+            "prior.file and the date in prior.calibrated; or name a reference"
+        )
 
     def _improve(self, channel: Channel) -> str:
         if self._turns_itself:
@@ -166,8 +178,7 @@ def _stated(channel: Channel, seen: Seen) -> str | None:
         return _timed(channel, seen)
     stops = channel.stops
     if not stops:
-        lacking = "positions, or rotation," if channel.reference else "a reference or positions"
-        return f"state {lacking} in the configuration: without them no window tells S or Q"
+        return "state positions, or rotation, in the configuration: without them no window tells S or Q"
     left = [stop for stop in stops if stop.position not in seen.used] or stops
     used = len(stops) - len(left) if left is not stops else len(stops)
     return f"{_taken(left[0])} and stay {STAY_S} s (positions used: {used} of {len(stops)})"

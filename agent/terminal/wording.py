@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -16,6 +17,7 @@ from agent.core.events import (
     Gap,
     Result,
     StatusChange,
+    WatchReport,
     WindowReport,
 )
 from agent.terminal.quantity import counted, size
@@ -45,6 +47,8 @@ def result_lines(result: Result, truth: Truth | None) -> list[str]:
             return lines + [f"  {row}" for row in calibration_rows(result.calibration)]
         case ClockReport():
             return [f"{result.sensor}: {clock_words(result)}"]
+        case WatchReport():
+            return [f"{result.sensor}: {watch_words(result)}"]
         case CalibrationUpdate():
             lines = [f"{result.sensor}: calibration from {result.windows} windows, {uncertainty_words(result)}"]
             lines += [f"  {row}" for row in calibration_rows(result)]
@@ -76,6 +80,21 @@ def clock_words(clock: ClockReport) -> str:
     if not math.isfinite(clock.lag_s):
         return words
     return f"{words}; lag {plus_minus(1e3 * clock.lag_s, 1e3 * COVERAGE_FACTOR * clock.u_lag_s)} ms"
+
+
+def watch_words(watch: WatchReport) -> str:
+    """An hour of a sensor without a reference: mean, noise, what was wrong with samples, and what the mean says."""
+    begin = datetime.fromtimestamp(watch.hour_utc_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    words = f"hour from {begin}: {watch.segments} minutes used"
+    if watch.segments:
+        mean, noise = (", ".join(f"{x:.{n}g}" for x in values) for values, n in (
+            (watch.mean_mps2, 6), (np.sqrt(watch.noise_psd).tolist(), 2)))  # fmt: skip
+        words += f"; mean {mean} m/s²; noise {noise} m/s²/√Hz"
+    if math.isfinite(watch.temperature_degc):
+        words += f"; {watch.temperature_degc:.1f} °C"
+    wrong = [f"{count} {name}" for name in ("missing", "clipped", "stuck") if (count := getattr(watch, name))]
+    words += f"; samples: {', '.join(wrong)}" if wrong else ""
+    return f"{words}; {watch.gravity}" if watch.gravity else words
 
 
 def gap_line(gap: Gap) -> str:

@@ -7,7 +7,7 @@ noise of single samples is stated separately.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,6 +35,12 @@ class Law:
     high_degc: float = np.nan
     u_beyond: float = 0.0
     determined: Flags = field(default_factory=lambda: np.ones(12, dtype=bool))
+
+    def aged(self, variance: Array) -> Law:
+        """The law where S and Q may have changed since, independently, by so much (12,)."""
+        covariance = self.covariance.copy()
+        covariance[range(12), range(12)] += variance
+        return replace(self, covariance=covariance)
 
     def at(self, degc: float) -> Calibration:
         """S and Q at a temperature in deg C. If it is NaN (not known), S and Q at the reference temperature, with an

@@ -11,6 +11,7 @@ import numpy as np
 from calib.estimate.quantities import (
     BEHIND,
     OFFSET_BEHIND,
+    OFFSET_RATE,
     OFFSET_TEMPERATURE,
     S_AND_Q,
     SENSITIVITY_BEHIND,
@@ -46,6 +47,15 @@ class Wander(Stated):
         tilt = self.of(TILT_WALK) * tilted_mps2
         walks = np.array([self.of(quantity.kind.walk) for quantity in S_AND_Q])
         return np.asarray((walks**2 + np.append(np.zeros(9), np.full(3, tilt**2))) * scale**2)
+
+    def variance_after(self, days: float, scale: float, tilted_mps2: float, u_rate: Array) -> Array:
+        """(12,) variance that S and Q gain in so many days in which nobody looks, in the squares of their units.
+
+        `scale`, `tilted_mps2` as in `variance_a_day`. `u_rate` (3,): by which Q may drift, in its unit a day.
+        """
+        grown = self.variance_a_day(scale, tilted_mps2) * days
+        grown[9:] += (u_rate * days) ** 2 + (scale * self.of(OFFSET_RATE.walk)) ** 2 * days**3 / 3.0
+        return grown
 
 
 @dataclass(frozen=True, slots=True)

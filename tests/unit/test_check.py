@@ -346,7 +346,7 @@ def test_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(capsys.readouterr().out)
     (plan,) = told.pop("plans")
     assert len(told.pop("warnings")) == 2  # this machine has none of the ports
-    assert told == {"good": True, "faults": [], **counts, "filters": filters}
+    assert told == {"good": True, "faults": [], **counts, "filters": filters, "watched": []}
     assert (plan["sensor"], plan["determined"], plan["needed"], plan["missing"]) == ("imu", 12, 12, [])
     assert plan["expanded_u_main_pct"] == pytest.approx(1.9, abs=0.05)
     path.write_text(GOOD.replace("bridge", "a bridge").replace("axes = 1", "axes = 2"))

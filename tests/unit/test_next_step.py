@@ -217,4 +217,4 @@ def test_the_line_is_shown_when_it_changes_and_stays_on_the_screen() -> None:
 def test_without_a_reference_and_positions_the_configuration_is_named() -> None:
     """The agent ended with an internal fault when it looked for the next of no positions."""
     guide = Guide(configured(reference=False), turns_itself=False)
-    assert said(guide, status(1, "UNCALIBRATED")).startswith("state a reference or positions in the configuration")
+    assert said(guide, status(1, "UNCALIBRATED")).startswith("calibrate it at a bench or by a visit")
