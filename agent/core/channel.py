@@ -17,6 +17,7 @@ from agent.core.events import CalibrationUpdate, Command, DeviceChange, Estimate
 from agent.core.fault import told
 from agent.core.identity import device_of, identity_of, nominal_of
 from agent.core.kept import keep, kept_as, plain, restated, shelved, take_up, update_of
+from agent.core.mean_watch import MeanWatch
 from agent.core.operators import CommandError, answer, commanded_pose
 from agent.core.outcome import (
     Source,
@@ -72,7 +73,7 @@ class ChannelState:
         self._status = ""  # no status was published yet
         self._refused = 0  # how many windows in a row were refused
         self._clocks, self._time = Clocks(), RunTime()
-        self._watched = Watch() if channel.watched else None
+        self._watched, self._means = (Watch() if channel.watched else None), MeanWatch()
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
         """Begin a new run. Seconds count from `origin_ns`. `kept`: a state (`memory`) for each identity of a sensor."""
@@ -99,8 +100,8 @@ class ChannelState:
             taken = self._streams.by_device[self.sensor], self._time.origin_utc_ns
             suspect = self._streams.suspect(block.device)
             law = self._law(self._estimation)
-            of = self._channel, law, self._estimation.residual_sd, self._in_force
-            results += accelerations(block, *taken, *of, suspect)
+            sd = self._estimation.residual_sd
+            results += accelerations(block, *taken, self._channel, law, sd, self._in_force, suspect)
             if self._watched is not None:
                 results += self._end_hour(self._watched.update(block, suspect, law))
         return results + list(self._close_windows()) + self._clock_reports()
@@ -161,7 +162,7 @@ class ChannelState:
             if self._estimation is not None:
                 self._kept = shelved(self._kept, self.identity, self.memory())
                 self._streams.forget_sensor()
-                self._watched = None if self._watched is None else Watch()
+                self._watched, self._means = (None if self._watched is None else Watch()), MeanWatch()
                 belongs, self._estimation = "", None
                 reason = f"{self.sensor} is another device now: {identity} instead of {self.identity}"
             known_as = kept_as(self._kept, identity, device_of(info))
@@ -340,7 +341,7 @@ class ChannelState:
             now = in_force_since(self._in_force, law, self._source())
             self._in_force = now
             results.append(now)
-        return [*results, watch_report(self._source(), hour, self._in_force, law)]
+        return [*results, watch_report(self._source(), hour, self._in_force, law, self._means)]
 
     def number(self, results: Sequence[Result]) -> None:
         """Take the numbers that the results got, so that the calibration in force and waiting estimates have theirs."""
@@ -365,7 +366,8 @@ class ChannelState:
         assert self._estimation is not None
         day = self._first_day + self._time.now_s / DAY_S
         held = self._filters, self._device, self._estimation, self._in_force, self._nominal
-        return keep(*held, day, self._time.utc_ns)
+        means = None if self._watched is None else self._means.snapshot()
+        return keep(*held, day, self._time.utc_ns, means)
 
     def memories(self) -> dict[str, bytes]:
         """`memory` by identity: of the device that is connected now and of those that were connected before."""
@@ -375,6 +377,8 @@ class ChannelState:
         kept = take_up(memory, self._filters, self._nominal)
         self._streams.state(self._filters.channel)
         self._estimation = kept.estimation
+        if kept.means is not None:
+            self._means.load(kept.means)
         self._estimation.gate.regain("")
         self._first_day = kept.first_day(self._time.utc_ns, self._time.now_s)
         if kept.in_force is None:
@@ -403,6 +407,7 @@ class ChannelState:
             "status": self._status,
             "refused": self._refused,
             "watch": None if self._watched is None else self._watched.snapshot(),
+            "means": None if self._watched is None else self._means.snapshot(),
             **self._clocks.snapshot(),
         }
 
@@ -424,3 +429,4 @@ class ChannelState:
         self._clocks.load(state)
         if self._watched is not None and (watch := state.get("watch")) is not None:  # earlier states have none
             self._watched.load(watch)
+            self._means.load(state["means"])

@@ -48,6 +48,7 @@ class Kept:
     how much of the kept state is used.
 
     `day`: the days that the estimation of the kept state had counted.
+    `means`: the snapshot of a MeanWatch, of a sensor that had no reference either.
     `moved`: the calibration in force is another one now, because a changed setting changed S, Q or their uncertainty.
     """
 
@@ -57,6 +58,7 @@ class Kept:
     t_utc_ns: int
     reason: str
     moved: bool = False
+    means: Mapping[str, Any] | None = None
 
     def first_day(self, t_utc_ns: int, now_s: float) -> float:
         """Days that the estimation has counted when the seconds of this run begin; now, `now_s` of them have passed."""
@@ -73,10 +75,12 @@ def keep(
     nominal: float | None,
     day: float,
     t_utc_ns: int,
+    means: Mapping[str, Any] | None = None,
 ) -> bytes:
     """The state for `take_up`, as bytes. `device` is the sensor, see agent.core.identity.device_of.
 
-    The channel as it is configured and `nominal`, the sensitivity by the data sheet, are for `past_of`.
+    `means`: the snapshot of a MeanWatch, of a sensor without a reference. The channel as it is configured and
+    `nominal`, the sensitivity by the data sheet, are for `past_of`.
     """
     return pack(
         {
@@ -89,6 +93,7 @@ def keep(
             "estimation": estimation.snapshot(),
             "day": day,
             "t_utc_ns": t_utc_ns,
+            "means": means,
         }
     )
 
@@ -163,7 +168,8 @@ def _kept_without_reference(
     size = _size(before.model_copy(update={"certificate": channel.certificate}), channel,
                  fresh.state.reference_frequency_hz)  # fmt: skip
     if size is None:
-        return Kept(fresh, in_force, day, t_utc_ns, "restored from the previous run")
+        reason = "restored from the previous run"
+        return Kept(fresh, in_force, day, t_utc_ns, reason, means=state.get("means"))
     moved = fresh.restate(None, remounted=False, size=size)
     return Kept(fresh, in_force, day, t_utc_ns, f"restored from the previous run; {OTHER_FILTERS}", moved)
 

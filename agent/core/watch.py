@@ -135,7 +135,7 @@ class Watch:
 
     def _end_segment(self, bands: Bands) -> None:
         if self._sound:
-            made = segment_of(self._held.astype(np.float64), bands)
+            made = segment_of(self._held, bands)
             told, total = self._degrees.tolist()
             whole = Segment(made.mean + self._zero, made.power, made.floor)
             self._segments.append((total / told if told else float("nan"), whole))
@@ -153,7 +153,7 @@ class Watch:
         bands, n = bands_of(self._rate_hz), len(segments)
         try:
             at = [law.at(degc) for degc, _ in segments]
-            back = [np.linalg.inv(one.sensitivity) for one in at]
+            back = [_inverse(one.sensitivity) for one in at]
         except np.linalg.LinAlgError:
             return None
         unknown = np.full(3, np.nan)
@@ -194,3 +194,7 @@ class Watch:
         self._held[:, : self._length] = state["held"]
         self._zero, self._filled = np.array(state["zero"]), state["filled"]
         self._sound, self._next, self._degrees = state["sound"], state["next"], np.array(state["degrees"])
+
+
+def _inverse(S: Array) -> Array:
+    return np.asarray(np.linalg.inv(S), dtype=np.float64)

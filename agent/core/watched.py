@@ -8,6 +8,7 @@ import numpy as np
 from agent.config import Channel
 from agent.core.estimation import DAY_S, STATED
 from agent.core.events import CalibrationUpdate, WatchReport
+from agent.core.mean_watch import MeanWatch
 from agent.core.outcome import Source, again
 from agent.core.watch import HOUR_NS, Hour
 from calib.estimate.correction import Law
@@ -70,9 +71,12 @@ def in_force_since(in_force: CalibrationUpdate, law: Law, source: Source) -> Cal
     return msgspec.structs.replace(again(now, in_force), budget=parts)
 
 
-def watch_report(source: Source, hour: Hour, in_force: CalibrationUpdate | None, law: Law) -> WatchReport:
-    """The result of an hour."""
+def watch_report(
+    source: Source, hour: Hour, in_force: CalibrationUpdate | None, law: Law, means: MeanWatch
+) -> WatchReport:
+    """The result of an hour, of which `means` takes note."""
     made = ("", 0) if in_force is None else in_force.made
+    gravity = means.update(hour, made, law)
     u = np.sqrt(law.covariance.diagonal()[MAIN]) / np.abs(law.mean[MAIN])
     degc, scatter_degc = hour.temperature_degc
     return WatchReport(
@@ -83,4 +87,5 @@ def watch_report(source: Source, hour: Hour, in_force: CalibrationUpdate | None,
         temperature_scatter_degc=scatter_degc, noise_psd=hour.noise_psd.tolist(), band_hz=hour.centre_hz.tolist(),
         band_power=hour.power[:3].ravel().tolist(), cross_power=hour.power[3:].ravel().tolist(),
         calibration_run_id=made[0], calibration_sequence=made[1], u_main_pct=(100.0 * u).tolist(),
+        gravity=gravity,
     )  # fmt: skip

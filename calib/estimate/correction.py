@@ -42,6 +42,10 @@ class Law:
         covariance[range(12), range(12)] += variance
         return replace(self, covariance=covariance)
 
+    def difference(self, degc: float, other_degc: float) -> Array:
+        """Derivative (12, n) of what S and Q are more at one temperature than at another, with respect to `mean`."""
+        return self._map(degc)[0] - self._map(other_degc)[0]
+
     def at(self, degc: float) -> Calibration:
         """S and Q at a temperature in deg C. If it is NaN (not known), S and Q at the reference temperature, with an
         uncertainty that covers the range of the data."""
@@ -110,12 +114,25 @@ def corrected(indications: Array, calibration: Calibration, residual_sd: Array) 
     return Corrected(acceleration, covariance, noise)
 
 
+def between(law: Law, degc: float, other_degc: float, acceleration: Array) -> Array:
+    """Covariance (3, 3) in m2/s4 of the difference of a corrected acceleration (3,) at two temperatures, due to the
+    uncertainty of the dependence on temperature; 0 where one of them is not known."""
+    if not np.isfinite(degc) or not np.isfinite(other_degc):
+        return np.zeros((3, 3))
+    through = _through(acceleration, law.at(degc)) @ law.difference(degc, other_degc)
+    return np.asarray(through @ law.covariance @ through.T)
+
+
 def calibration_part(acceleration: Array, calibration: Calibration) -> Array:
     """Covariance (3, 3) in m2/s4 of one corrected acceleration (3,) due to the uncertainty of S and Q."""
+    through = _through(acceleration, calibration)
+    return np.asarray(through @ calibration.covariance @ through.T)
+
+
+def _through(acceleration: Array, calibration: Calibration) -> Array:
+    """(3, 12) by how much a corrected acceleration is larger, for what S and Q are larger, but for the sign."""
     J = np.zeros((3, 12))
     for i in range(3):
         J[i, 3 * i : 3 * i + 3] = acceleration
         J[i, 9 + i] = 1.0
-    inverse = np.linalg.inv(calibration.sensitivity)
-    through = inverse @ J
-    return np.asarray(through @ calibration.covariance @ through.T)
+    return np.asarray(np.linalg.inv(calibration.sensitivity) @ J)

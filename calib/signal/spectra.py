@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.distributions import NORMAL
 from calib.model import Array
@@ -102,14 +103,19 @@ def bands_of(rate_hz: float) -> Bands:
     return Bands(rate_hz, samples, centre, edges, scatter, groups, _scatter(np.ones(max(groups[1] - groups[0], 1))))
 
 
-def segment_of(x: Array, bands: Bands) -> Segment:
-    """The sums of one segment x (3, samples): PSDs of all its lines under Hann's window, one-sided, as one transform.
+def segment_of(x: Array | NDArray[np.float32], bands: Bands) -> Segment:
+    """The sums of one segment x (3, samples), by the PSDs of all its lines under Hann's window, one-sided.
 
     The power of a band is the integral of the PSD between its edges; a line at k has the width of a line around k.
     """
     window = hanning(bands.samples)
-    mean = x.mean(axis=1)
-    lines = [np.fft.rfft((own - m) * window) for own, m in zip(x, mean, strict=True)]
+    mean, lines = np.zeros(3), []
+    for i, own in enumerate(x):
+        held = own.astype(np.float64)
+        mean[i] = held.mean()
+        held -= mean[i]
+        held *= window
+        lines.append(np.fft.rfft(held))
     scale = 2.0 / (bands.rate_hz * float(np.sum(window**2)))
     ends = np.array(bands.groups)
     power, floor = np.zeros((6, len(bands.centre_hz))), np.zeros((3, len(ends) - 1))
@@ -150,7 +156,7 @@ def robust_power(power: Array, bands: Bands) -> Array:
             together = by_band[i] + by_band[k]
             twice = 2.0 * by_band[number]
             found[number] = 0.25 * (median(together + twice) - median(together - twice))
-    return found / share
+    return np.asarray(found / share)
 
 
 def noise_floor(floor: Array, bands: Bands) -> Array:

@@ -310,3 +310,19 @@ def test_another_device_begins_anew() -> None:
     for _ in range(200):
         site.step(other.block())
     assert hours(site.results)[0].samples <= 200 * 200
+
+
+def test_what_the_mean_was_at_the_calibration_is_known_after_a_restart() -> None:
+    """A week before the restart, and two days after it with z less by half a per cent."""
+    config, kept, sayings = watched_config(prior=PRIOR), dict[str, bytes](), list[str]()
+    for days, share in ((7.2, 1.0), (2.0, 0.995)):
+        site, world = Site(config, kept, day=10.0 - days), World(t_s=10.0, rate_hz=2.0)
+        opened(site)
+        for _ in range(round(days * 48)):
+            made = world.block(1800.0)
+            utc_ns = made.t_utc_ns + round((10.0 - days) * 86_400) * SECOND
+            site.step(replace(made, t_utc_ns=utc_ns, indications=made.indications * [1.0, 1.0, share]))
+        sayings.append(hours(site.results)[-1].gravity)
+        kept = {memory.identity: memory.state for memory in site.pipeline.all_memories()}
+    assert sayings[0] == ""
+    assert "the sensitivity of z by -0.5 %" in sayings[1]
