@@ -234,7 +234,10 @@ def update_of(state: dict[str, Any] | None) -> CalibrationUpdate | None:
 
 def _basis(channel: Channel) -> dict[str, str]:
     included = set(STATED | MOUNT | WINDOWS) - {"poses", "positions", "fixed_mount", "check_rotation"}
-    whole: dict[str, Any] = channel.model_dump(mode="json", include=included) | {"fixed_mount": channel.fixed_mount}
+    stated = channel.model_dump(
+        mode="json", include=included, exclude={"prior": {"calibrated"}}
+    )  # a date moves nothing
+    whole: dict[str, Any] = stated | {"fixed_mount": channel.fixed_mount}
     if channel.check_reference is not None:
         whole["check_rotation"] = channel.check_reference.rotation
     whole["poses"] = _by_position((pose_of(pose, channel), pose) for pose in channel.poses)
