@@ -6,7 +6,9 @@ import importlib
 
 import click
 
-COMMANDS = {"adjust": "agent.cli.fleet_adjust", "replay": "agent.cli.fleet_replay"}
+COMMANDS = {
+    "adjust": "agent.cli.fleet_adjust", "replay": "agent.cli.fleet_replay", "watch": "agent.cli.fleet_watch",
+}  # fmt: skip
 
 
 class _Commands(click.Group):

@@ -1,0 +1,130 @@
+"""The hours of a day condensed to one value for each channel of each sensor.
+
+A channel is one of six numbers of a band: the log amplitude of the outputs x, y, z (half the log of the band's power
+without noise), and the normalised cross powers xy, xz, yz (cross power over the product of the amplitudes).
+
+In each hour the level of a band and axis is free, since nobody knows how the structure was excited. It is taken out by
+a median over the sensors of what each differs from its own median of the day (Tukey's median polish); what remains is
+averaged with outliers clipped. So a sensor that misses some hours does not move the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.model import Array
+
+HOURS = 24
+FEWEST_HOURS = 6  # of a day, for a channel to count
+LEAST_RATIO = 3.0  # power of the signal over that of the noise, in a band and hour that count
+U_NOISE = 0.05  # relative standard uncertainty of the noise floor of a day
+U_FLOOR = (
+    0.003  # of the log amplitude of a whole day, however little noise there is; only ratios of weights depend on it
+)
+CLIP = 3.0  # standard deviations
+MAD = 1.4826  # standard deviation over the median of absolute deviations, of a normal distribution
+ROUNDS = 2  # of the median polish
+WIDTH = 10.0**0.05 - 10.0**-0.05  # of a third octave, over its nominal centre (IEC 61260-1)
+PAIRS = (0, 0, 1), (1, 2, 2)  # xy, xz, yz
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hours:
+    """Hourly results of n sensors in B bands; NaN where there is none.
+
+    `hour` (H,): hours since 1970 in UTC. `power`, `cross` (H, n, B, 3): mean squares of x, y, z and real cross
+    powers xy, xz, yz, (m/s²)². `noise_psd` (H, n, 3), (m/s²)²/Hz. `temperature_degc` (H, n).
+    """
+
+    hour: Array
+    power: Array
+    cross: Array
+    noise_psd: Array
+    temperature_degc: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Day:
+    """One day. `value`, `u` (n, B, 6): the channels with the standard uncertainty that their noise gives; NaN and inf
+    where a channel does not count. `level` (B, 3): log amplitude of the level. `log_noise` (n, 3): half the log of the
+    noise floor. `temperature_degc`: the median of all sensors; NaN where none tells one.
+    """
+
+    number: int
+    value: Array
+    u: Array
+    level: Array
+    log_noise: Array
+    temperature_degc: float
+
+
+def day_of(hours: Hours, band_hz: Array) -> Day:
+    """Condense the hours of one UTC day. `band_hz` (B,): nominal centres of the bands."""
+    floor = hours.noise_psd[:, :, None, :] * (WIDTH * band_hz)[:, None]
+    signal = hours.power - floor
+    with np.errstate(invalid="ignore", divide="ignore"):
+        counts = (signal > LEAST_RATIO * floor) & np.isfinite(signal)
+        signal = np.where(counts, signal, np.nan)
+        amplitude = 0.5 * np.log(signal)
+        cross = hours.cross / np.sqrt(signal[..., PAIRS[0]] * signal[..., PAIRS[1]])
+        ratio = floor / signal
+    cross = np.where(np.abs(cross) <= 1.5, cross, np.nan)
+    present = np.sum(counts, axis=0)  # (n, B, 3)
+    value, level = _polished(amplitude)
+    both = np.sum(np.isfinite(cross), axis=0)
+    number = np.concatenate([present, both], axis=2)
+    told = number >= FEWEST_HOURS
+    u_noise = 0.5 * U_NOISE * np.nan_to_num(_mean(ratio))
+    u_noise = np.concatenate([u_noise, u_noise[..., PAIRS[0]] + u_noise[..., PAIRS[1]]], axis=2)
+    u = np.sqrt(U_FLOOR**2 * HOURS / np.maximum(number, 1) + u_noise**2)
+    values = np.concatenate([value, _clipped_mean(cross)], axis=2)
+    temperatures = hours.temperature_degc[np.isfinite(hours.temperature_degc)]
+    return Day(
+        int(hours.hour[0]) // HOURS,
+        np.where(told, values, np.nan),
+        np.where(told, u, np.inf),
+        level,
+        0.5 * np.log(_positive(_median(hours.noise_psd))),
+        float(np.median(temperatures)) if temperatures.size else np.nan,
+    )
+
+
+def _polished(amplitude: Array) -> tuple[Array, Array]:
+    """The value of each sensor (n, B, 3) against the level, and the level of the day (B, 3), from (H, n, B, 3)."""
+    own = _median(amplitude)
+    own = own - _median(own)
+    for _ in range(ROUNDS):
+        level = _median(np.moveaxis(amplitude - own, 1, 0))  # (H, B, 3)
+        rest = amplitude - level[:, None]
+        own = _median(rest)
+    return _clipped_mean(rest), _mean(level)
+
+
+def _clipped_mean(values: Array) -> Array:
+    """Mean over the first axis, with what is far from the median brought to CLIP standard deviations."""
+    centre = _median(values)
+    reach = CLIP * MAD * _median(np.abs(values - centre))
+    return _mean(np.clip(values, centre - reach, centre + reach))
+
+
+def _median(values: Array) -> Array:
+    """Median over the first axis without NaN; NaN where there is nothing. Quicker than numpy's for short axes."""
+    ordered = np.sort(np.moveaxis(values, 0, -1), axis=-1)  # NaN come last
+    number = np.sum(np.isfinite(ordered), axis=-1)
+    low, high = np.maximum(number - 1, 0) // 2, np.minimum(number // 2, len(values) - 1)
+    both = np.take_along_axis(ordered, np.stack([low, high], axis=-1), axis=-1)
+    return np.where(number > 0, both.mean(axis=-1), np.nan)
+
+
+def _mean(values: Array) -> Array:
+    """Mean over the first axis without NaN; NaN where there is nothing."""
+    there = np.isfinite(values)
+    number = there.sum(axis=0)
+    total = np.where(there, values, 0.0).sum(axis=0)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+def _positive(values: Array) -> Array:
+    return np.where(values > 0.0, values, np.nan)

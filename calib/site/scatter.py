@@ -1,0 +1,86 @@
+"""How far the scatter of days is from independent, learned from what each day differs from its expectation.
+
+Standardised one-day residuals of a sound model are independent with variance 1. Sums over 1, 7 and 28 days, divided
+by the root of their number, then have variance 1 too. Where days depend on each other (AR(1) of the scatter, a norm
+that does not fit the season) longer sums have more. The ratio is the inflation of the variance of a mean over so
+many days. It is a median over sensors, so a sensor that changes does not loosen the test of the others.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from calib.model import Array
+
+LAGS_DAYS = (1, 7, 28)
+PRIOR_BLOCKS = 5.0  # by which a sensor's own inflation is drawn to the median of all
+CLIP = 4.0  # standard deviations of a residual or block
+
+
+class Blocks:
+    """Sums of standardised residuals over blocks of `lags` days; `shape`: of what is summed, sensors first."""
+
+    def __init__(self, shape: tuple[int, ...], lags: tuple[int, ...] = LAGS_DAYS) -> None:
+        self.lags = lags
+        self.sums, self.days, self.squares, self.count = (np.zeros((len(lags), *shape)) for _ in range(4))
+        self.past: dict[int, tuple[Array, Array]] = {}
+
+    def update(self, z: Array, there: Array) -> None:
+        """Take the residuals of a day; `there`: which of them count."""
+        for k, lag in enumerate(self.lags):
+            self.sums[k] += np.where(there, z, 0.0)
+            self.days[k] += there
+            full = self.days[k] >= lag
+            block = np.clip(self.sums[k], -CLIP * lag**0.5, CLIP * lag**0.5)
+            self.squares[k] += np.where(full, block**2 / lag, 0.0)
+            self.count[k] += full
+            self.sums[k][full] = self.days[k][full] = 0.0
+
+    def inflation(self) -> Array:
+        """(lags, ...): variance ratio of each lag, the median over sensors; 1 where nothing is known, never less."""
+        some = self.count > 0
+        each = np.where(some, self.squares / np.where(some, self.count, 1.0), np.nan)
+        known = some.any(axis=1)
+        middle = np.ones(known.shape)
+        for k in range(len(self.lags)):
+            if known[k].any():
+                number = np.maximum(np.median(self.count[k], axis=0), 1.0)[known[k]]
+                # The median of chi-squared over its degrees of freedom (Wilson and Hilferty).
+                middle[k][known[k]] = np.nanmedian(each[k][:, known[k]], axis=0) / (1.0 - 2.0 / (9.0 * number)) ** 3
+        return np.maximum.accumulate(np.maximum(middle, 1.0), axis=0)
+
+    def remember(self, begins: list[int]) -> None:
+        """Keep what is known today, at the last of these begins of steps, and at the others what was known then."""
+        self.past[begins[-1]] = self.squares.copy(), self.count.copy()
+        self.past = {begin: self.past[begin] for begin in begins}
+
+    def over(self, today: int, begins: list[int]) -> Array:
+        """Inflation of the means from these days until today, (k, n, ...), by the longest lag that is not longer.
+
+        A sensor's own, as it was before the begin, drawn to the median of all as by PRIOR_BLOCKS blocks.
+        """
+        middle = self.inflation()
+        told = []
+        for begin in begins:
+            k = int(np.searchsorted(self.lags, today - begin + 1, side="right")) - 1
+            squares, count = (part[k] for part in self.past[begin])
+            told.append((squares + PRIOR_BLOCKS * middle[k]) / (count + PRIOR_BLOCKS))
+        return np.maximum(np.array(told), 1.0)
+
+    def snapshot(self) -> dict[str, Any]:
+        """All state as plain arrays."""
+        now = {name: getattr(self, name).copy() for name in _STATE}
+        past = np.array(list(self.past.values())).reshape(len(self.past), 2, *self.squares.shape)
+        return {**now, "begins": np.array(list(self.past), dtype=np.int64), "past": past}
+
+    def load(self, told: dict[str, Any]) -> None:
+        """Go on from a snapshot."""
+        for name in _STATE:
+            setattr(self, name, told[name].copy())
+        self.past = {int(begin): (past[0].copy(), past[1].copy())
+                     for begin, past in zip(told["begins"], told["past"], strict=True)}  # fmt: skip
+
+
+_STATE = ("sums", "days", "squares", "count")

@@ -1,0 +1,150 @@
+"""`fieldcal fleet watch`: files of hourly results, whatever is in them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from agent.cli.fleet import fleet
+
+HOUR_NS = 3_600_000_000_000
+FIRST_H = 24 * 20_000
+BANDS_HZ = [1.0, 1.259, 1.585, 1.995]
+DAYS, CHANGED = 40, 28
+SENSORS = [("north", "a"), ("north", "b"), ("middle", "c"), ("middle", "d"), ("south", "e"), ("south", "f")]
+
+
+def lines() -> list[dict[str, Any]]:
+    """Six sensors of three gateways; from day CHANGED on, z of sensor c indicates 3 % less."""
+    random, made = np.random.default_rng(1), []
+    shape = random.normal(0.0, 0.3, (len(SENSORS), 3, 4))
+    for hour in range(24 * DAYS):
+        level, degc = random.normal(0.0, 0.3, (3, 4)), 10.0 + 5.0 * np.sin(hour / 200.0)
+        for i, (gateway, sensor) in enumerate(SENSORS):
+            a = shape[i] + level + random.normal(0.0, 0.01, (3, 4))
+            rho = 0.2 + random.normal(0.0, 0.01, (3, 4))
+            if i == 2 and hour >= 24 * CHANGED:
+                a[2] += np.log(0.97)
+            cross = rho * np.exp(a[[0, 0, 1]] + a[[1, 2, 2]])
+            made.append({
+                "gateway": gateway, "sensor": sensor, "hour_utc_ns": (FIRST_H + hour) * HOUR_NS, "duration_s": 3600.0,
+                "samples": 360_000, "sequence": hour, "noise_psd": [1e-6] * 3, "band_hz": BANDS_HZ,
+                "band_power": (np.exp(2.0 * a) + 1e-6).ravel().tolist(), "cross_power": cross.ravel().tolist(),
+                "temperature_degc": degc, "calibration_run_id": "run", "calibration_sequence": 3,
+                "u_main_pct": [0.2] * 3,
+            })  # fmt: skip
+    return made
+
+
+@pytest.fixture(scope="module")
+def clean() -> list[dict[str, Any]]:
+    return lines()
+
+
+def run(directory: Path, rows: list[Any], *options: str) -> Result:
+    file = directory / "hours.jsonl"
+    file.write_text("\n".join(row if isinstance(row, str) else json.dumps(row) for row in rows) + "\n")
+    return CliRunner().invoke(fleet, ["watch", str(file), *options], standalone_mode=False)
+
+
+def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    told = run(tmp_path, clean, "--json", "-")
+    assert told.exception is None
+    assert told.return_value == 3
+    found = json.loads(told.stdout)
+    changed = [one for one in found["sensors"] if one["verdict"] != "none"]
+    assert [(one["gateway"], one["sensor"], one["verdict"], one["what"]) for one in changed] == [
+        ("middle", "c", "sensitivity", "sensitivity of z")
+    ]
+    assert abs(changed[0]["size"] + 3.0) < changed[0]["expanded_uncertainty"] + 0.05 < 1.0
+    assert changed[0]["earliest"] <= "2024-11-01" <= changed[0]["latest"]  # day 20,028
+    assert found["visit_order"][0] == "middle/c"
+    assert found["left_out"] == {}
+
+    hostile: list[Any] = [dict(row) for row in clean]
+    np.random.default_rng(2).shuffle(hostile)  # type: ignore[arg-type]
+    first = clean[0]
+    hostile[100:100] = [
+        "no JSON", "[1, 2]", '{"sensor": 3}', '{"a":' * 5000, "\x00\xff",
+        {**first, "hour_utc_ns": first["hour_utc_ns"] + 1},  # a clock that jumps
+        {**first, "hour_utc_ns": 10 * HOUR_NS},
+        {**first, "band_power": first["band_power"][:5]},
+        {**first, "band_hz": [1.0, 1.1, 1.2, 1.3]},
+        {**first, "band_hz": [1.0, 1.0, 1.259, 1.585]},
+        {**first, "band_power": [1e300] * 12},
+        {**first, "temperature_degc": 1e9},
+        {**first, "duration_s": 60.0},
+        {**first, "stuck": 300_000},
+        {**first, "sequence": -1, "band_power": [5.0] * 12},  # an older result for the same hour
+    ]  # fmt: skip
+    again = run(tmp_path, hostile, "--json", "-")
+    assert again.exception is None
+    after = json.loads(again.stdout)
+    assert sum(after["left_out"].values()) == 15
+    assert after["lines"] == len(hostile)
+    by_name = {one["sensor"]: one for one in after["sensors"]}
+    for one in found["sensors"]:
+        other = by_name[one["sensor"]]
+        assert (other["verdict"], other["since"]) == (one["verdict"], one["since"])
+        assert np.allclose(other["least_detectable_pct"], one["least_detectable_pct"], rtol=1e-9)
+
+
+def test_nulls_other_grids_and_sensors_that_come_and_go(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    rows = [dict(row) for row in clean if row["sequence"] < 24 * CHANGED]
+    rows = [row for row in rows if row["sensor"] != "f" or row["sequence"] > 24 * 20]
+    for k, row in enumerate(rows):
+        if row["sensor"] == "a":
+            row["band_power"] = [None] * 4 + row["band_power"][4:]  # x is dead
+        if k % 7 == 0:
+            row["temperature_degc"] = None
+        if row["sensor"] == "b":  # without the last band
+            row["band_hz"] = BANDS_HZ[:3]
+            for name in ("band_power", "cross_power"):
+                row[name] = np.array(row[name]).reshape(3, 4)[:, :3].ravel().tolist()
+    told = run(tmp_path, rows)
+    assert told.exception is None
+    assert told.return_value == 0, told.output
+    assert "north/a" in told.output
+    assert "learning" in next(line for line in told.output.splitlines() if line.startswith("south/f"))
+    assert "no sensor stands beside a reference" in told.output
+
+
+def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    rows = [dict(row) for row in clean]
+    for row in rows:
+        if row["sensor"] == "c" and row["sequence"] >= 24 * CHANGED + 9:
+            row["calibration_sequence"] = 4
+    told = run(tmp_path, rows)
+    assert told.return_value == 0, told.output
+    assert "learning" in next(line for line in told.output.splitlines() if line.startswith("middle/c"))
+
+
+def test_bad_files_and_options(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    told = run(tmp_path, ["", "nothing"])
+    assert told.return_value == 2
+    assert "no line is an hourly result" in told.stderr
+    missing = CliRunner().invoke(fleet, ["watch", str(tmp_path / "absent")], standalone_mode=False)
+    assert missing.return_value == 2
+    assert "absent" in missing.stderr
+    few = clean[: 6 * 24]
+    unknown = run(tmp_path, few, "--beside-reference", "north/z")
+    assert "no sensor of the files" in str(unknown.exception)
+    known = run(tmp_path, few, "--beside-reference", "north/a")
+    assert known.return_value == 0
+    assert "learning" in known.output
+
+
+def test_a_reference_shows_what_all_others_share(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    rows = [dict(row) for row in clean if row["sensor"] != "c"]
+    for row in rows:
+        if row["sensor"] != "a" and row["sequence"] >= 24 * CHANGED:
+            row["band_power"] = [1.02**2 * value for value in row["band_power"]]
+            row["cross_power"] = [1.02**2 * value for value in row["cross_power"]]
+    told = json.loads(run(tmp_path, rows, "--beside-reference", "north/a", "--json", "-").stdout)
+    assert told["common"]["size"] == pytest.approx(2.0, abs=told["common"]["expanded_uncertainty"])
+    assert told["common"]["expanded_uncertainty"] < 1.0
