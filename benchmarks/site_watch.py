@@ -192,7 +192,7 @@ def wilson(hits: int, of: int) -> str:
     z, p = 1.96, hits / of
     middle, half = (p + z * z / (2 * of)), z * np.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
     low, high = (100 * (middle + sign * half) / (1 + z * z / of) for sign in (-1, 1))
-    return f"{100 * p:.1f} % ({low:.0f} to {high:.0f})"
+    return f"{100 * p:.1f} % ({max(low, 0.0):.0f} to {high:.0f})"
 
 
 def rows_of_one(count: Counter[str]) -> list[str]:
