@@ -15,14 +15,16 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agent.fleet.simulated import SimulatedFleet
-from agent.fleet.simulated_sensor import WRONG_FROM
+from agent.fleet.simulated import NEVER, SimulatedFleet, behaviours
+from agent.fleet.simulated_sensor import BEGINS
 from benchmarks.page import machine, write_part
 from tests.unit.browser import chromium
 from tests.unit.monitor_site import Monitor
 from tests.unit.zenoh_site import Site, wait_for
 
 GATEWAYS, SENSORS, SEED = 100, 10, 7
+ROUNDS = 12  # of all gateways, 30 days apart; a drift is told then
+HELD_FROM = BEGINS["held"]
 DOCS = Path(__file__).resolve().parents[1] / "docs" / "fleet.md"
 DAY_NS = 86_400_000_000_000
 SCROLLS, SCROLL_PX, APART_MS = 60, 240, 50
@@ -76,6 +78,13 @@ def run(browser: Any, monitor: Monitor, change: Any) -> dict[str, float]:
     return found
 
 
+def make(fleet: SimulatedFleet, rounds: int, monitor: Monitor, sensors: int) -> None:
+    """Rounds of results, 30 days apart. `sensors`: that the page then has."""
+    for k in range(rounds):
+        fleet.step(time.time_ns() - (rounds - k) * 30 * DAY_NS)
+        wait_for(lambda: len(monitor.sensors()) >= sensors, 120.0)
+
+
 def main() -> None:
     """Measure, and print or write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -83,18 +92,22 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="put the table into docs/fleet.md")
     args = parser.parse_args()
     site = Site()
+    kinds = behaviours(GATEWAYS, SEED)
+    # One gateway for each run has made all but the round in which its first sensor is held.
+    late = [k for k, kind in enumerate(kinds) if kind in ("held", "leaning")][: args.runs]
+    others = [k for k in range(GATEWAYS) if k not in late]
     with tempfile.TemporaryDirectory() as directory, chromium() as browser:
-        monitor = Monitor(site.endpoint, Path(directory) / "monitor")
-        with SimulatedFleet(GATEWAYS, SENSORS, SEED, [site.endpoint], Path(directory) / "fleet") as fleet:
-            for k in range(WRONG_FROM):
-                fleet.step(time.time_ns() - (WRONG_FROM - k) * 60 * DAY_NS)
-                wait_for(lambda: len(monitor.sensors()) == GATEWAYS * SENSORS, 120.0)
-            for gateway in fleet.gateways:  # drifts and what is silent, so that there are cards
-                if gateway.behaviour in ("drifting", "hostile"):
-                    for k in range(3):
-                        gateway.step(time.time_ns() - (3 - k) * DAY_NS)
-            wrong = [gateway for gateway in fleet.gateways if gateway.behaviour == "wrong"][: args.runs]
-            runs = [run(browser, monitor, lambda g=gateway: g.step(time.time_ns())) for gateway in wrong]
+        monitor, data = Monitor(site.endpoint, Path(directory) / "monitor"), Path(directory) / "fleet"
+        with (
+            SimulatedFleet(GATEWAYS, SENSORS, SEED, [site.endpoint], data, others) as fleet,
+            SimulatedFleet(GATEWAYS, SENSORS, SEED, [site.endpoint], data, late) as to_be_held,
+        ):
+            make(fleet, ROUNDS, monitor, len(others) * SENSORS)
+            make(to_be_held, HELD_FROM, monitor, GATEWAYS * SENSORS)
+            runs = [
+                run(browser, monitor, lambda g=gateway: g.step(time.time_ns(), NEVER))
+                for gateway in to_be_held.gateways
+            ]
         monitor.stop()
     site.kill()
     lines = [f"{GATEWAYS * SENSORS} sensors of {GATEWAYS} gateways, {len(runs)} runs; {machine()}.", "",

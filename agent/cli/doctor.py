@@ -35,7 +35,8 @@ WORDS = {"good": "good  ", "advice": "advice", "fault": "FAULT "}
               help="Read the devices for S seconds, and compare with their rates. Stop the agent first.")  # fmt: skip
 @click.option("--json", "json_to", type=click.Choice(["-"]), help="One JSON object on standard output.")
 def doctor(config: Path | None, data_dir: Path, measure_s: float | None, json_to: str | None) -> int:
-    """Check this gateway: clock, devices, bus clocks, rates, disk, certificates, signing key, router, optional parts.
+    """Check this gateway: clock, devices, bus clocks, rates, disk, certificates, signing key, router, MQTT broker,
+    optional parts.
 
     Each line is good, advice (it works, with a disadvantage) or FAULT (it does not work, or soon will not), with a
     remedy. Without CONFIG only the machine is checked. Run it as the agent's user: rights are those of the caller.
@@ -83,6 +84,7 @@ def _findings(path: Path | None, data_dir: Path, measure_s: float | None) -> Ite
         yield from machine_checks.certificate_findings(config, now)
         yield from key_checks.signing_key_findings(config, data_dir)
         yield from machine_checks.router_findings(config)
+        yield from machine_checks.broker_findings(config, data_dir)
     yield from machine_checks.extra_findings()
 
 

@@ -16,7 +16,8 @@ import click
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
-    from multiprocessing.synchronize import Event
+    from agent.fleet.simulated import Stop
+    from agent.fleet.simulated_processes import FleetProcesses
 
 FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; docs/fleet.md has what was measured
 ROUTER_S = 30.0  # s to wait for a router
@@ -61,10 +62,9 @@ def serve_fleet(
     from agent.config.known_keys import add_key
     from agent.delivery.router import DEFAULT_ENDPOINT
     from agent.delivery.session import EndpointError
-    from agent.fleet.simulated import ODD
-    from agent.fleet.simulated_processes import GATEWAYS_EACH, SPAWN, FleetProcesses
+    from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses, Stopping
 
-    endpoint, stop = connect or DEFAULT_ENDPOINT, SPAWN.Event()
+    endpoint, stop = connect or DEFAULT_ENDPOINT, Stopping()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     try:
@@ -79,28 +79,49 @@ def serve_fleet(
                     for gateway in simulated.gateways:
                         add_key(keys, gateway.source, gateway.public_key)
                 say(f"{fleet} gateways with {sensors} sensors each at {endpoint}, seed {seed}")
-                for behaviour in ODD:
-                    names = simulated.names_of(behaviour)
-                    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-                    say(f"{behaviour}: {', '.join(names[:NAMES_SHOWN]) or 'none'}{more}")
-
-                def step(t_utc_ns: int) -> int:
-                    made = simulated.step(t_utc_ns)
-                    if truth is not None:
-                        _write_truth(truth, {"seed": seed, "t_utc_ns": t_utc_ns, "gateways": simulated.truth()})
-                    return made
-
+                _say_odd(simulated)
+                step = _step_of(simulated, stop, truth, seed)
                 results = _run(step, stop, every_s, speed, age_days, duration_s)
             say(f"{results} results sent")
     except BrokenProcessPool:
-        say(
-            "fieldcal simulate: a process of the fleet ended: there is too little memory for so many gateways", err=True
-        )
-        return 1
+        if not stop.is_set():
+            fault = "a process of the fleet ended: there is too little memory for so many gateways"
+            say(f"fieldcal simulate: {fault}", err=True)
+            return 1
     except (EndpointError, KeyFileError, OSError) as error:
         say(f"fieldcal simulate: {error}", err=True)
         return 2
     return 0
+
+
+def _say_odd(simulated: FleetProcesses) -> None:
+    from agent.fleet.simulated import ODD
+
+    for behaviour in ODD:
+        names = simulated.names_of(behaviour)
+        more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+        say(f"{behaviour}: {', '.join(names[:NAMES_SHOWN]) or 'none'}{more}")
+
+
+def _step_of(simulated: FleetProcesses, stop: Stop, truth: Path | None, seed: int) -> Callable[[int], int]:
+    """One round of all gateways, after which `truth` is written; it gives the number of results.
+
+    It raises BrokenProcessPool where a process has ended though it was not to stop.
+    """
+    from concurrent.futures.process import BrokenProcessPool
+
+    def step(t_utc_ns: int) -> int:
+        try:
+            made = simulated.step(t_utc_ns)
+            if truth is not None:
+                _write_truth(truth, {"seed": seed, "t_utc_ns": t_utc_ns, "gateways": simulated.truth()})
+        except BrokenProcessPool:
+            if not stop.is_set():
+                raise
+            return 0  # a process has not ended this round in time
+        return made
+
+    return step
 
 
 def _write_truth(path: Path, truth: dict[str, Any]) -> None:
@@ -111,7 +132,7 @@ def _write_truth(path: Path, truth: dict[str, Any]) -> None:
 
 
 def _run(
-    step: Callable[[int], int], stop: Event, every_s: float, speed: float, age_days: float,
+    step: Callable[[int], int], stop: Stop, every_s: float, speed: float, age_days: float,
     duration_s: float | None,
 ) -> int:  # fmt: skip
     """Step until it is to stop; returns the number of results."""
@@ -137,7 +158,7 @@ def _files_fault(gateways: int) -> str:
     return ""
 
 
-def _router_fault(endpoint: str, stop: Event) -> str:
+def _router_fault(endpoint: str, stop: Stop) -> str:
     """Wait for the router; why there is none, "" if there is one. Raises EndpointError."""
     from agent.delivery.router import router_running
 

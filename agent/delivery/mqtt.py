@@ -129,6 +129,23 @@ class MqttPublisher:
             fault=next(iter(self._faults.values()), ""),
         )  # fmt: skip
 
+    def attempt(self, client_id: str) -> str:
+        """Connect once under this client_id, and leave: why the broker does not take it, "" where it does.
+
+        Nothing is published, and a connection of the agent under its own client_id stays.
+        """
+        self._client_id = client_id
+        try:
+            client = self._client(will=False)
+            with contextlib.closing(client.socket()):
+                self._await_answer(client)
+                client.disconnect()
+        except BrokerLostError as error:
+            return str(error)
+        except Exception as error:  # the library raises anything on bytes that are no MQTT
+            return self._no_broker(error)
+        return ""
+
     def close(self, timeout_s: float = CLOSE_S) -> None:
         """Publish what waits if a broker is connected, say that the gateway is off, and close."""
         self._stop.set()
@@ -166,7 +183,7 @@ class MqttPublisher:
             except BrokerLostError as error:
                 self._fail("", str(error))
             except Exception as error:  # the library raises anything on bytes that are no MQTT
-                self._fail("", f"{self._where}: what answers there is no broker of MQTT 5: {error!r}")
+                self._fail("", self._no_broker(error))
             self._connected = False
             held = time.monotonic() - begun > pause_s + ANSWER_S
             pause_s = self._pause_s if held else min(2 * pause_s, LONGEST_PAUSE_S)
@@ -191,6 +208,9 @@ class MqttPublisher:
     def _where(self) -> str:
         return f"{self._settings.host}:{self._settings.port}"
 
+    def _no_broker(self, error: Exception) -> str:
+        return f"{self._where}: what answers there is no broker of MQTT 5: {error!r}"
+
     def _serve(self) -> None:
         """Connect, and publish until the connection ends or `close` is called. Raises BrokerLostError."""
         client = self._client()
@@ -207,8 +227,8 @@ class MqttPublisher:
                 if (held := client.socket()) is not None:
                     held.close()
 
-    def _client(self) -> Any:
-        """A client that is being connected. Raises BrokerLostError."""
+    def _client(self, *, will: bool = True) -> Any:
+        """A client that is being connected, with a will or without one. Raises BrokerLostError."""
         library, settings = self._library, self._settings
         client = library.Client(
             library.CallbackAPIVersion.VERSION2, self._client_id, protocol=library.MQTTv5, reconnect_on_failure=False
@@ -218,7 +238,8 @@ class MqttPublisher:
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         client.on_publish = self._on_publish
-        client.will_set(f"{self._topic}/alive", "offline", 1, True)
+        if will:
+            client.will_set(f"{self._topic}/alive", "offline", 1, True)
         if settings.username is not None:
             client.username_pw_set(settings.username, self._password)
         if self._tls is not None:
@@ -232,16 +253,20 @@ class MqttPublisher:
 
     def _begin(self, client: Any) -> None:
         """Wait for the broker's answer, then let all topics be sent. Raises BrokerLostError."""
-        latest = time.monotonic() + ANSWER_S
-        while self._answer is None:
-            if time.monotonic() > latest:
-                raise BrokerLostError(f"{self._where}: the broker did not answer within {ANSWER_S:g} s")
-            self._turn(client)
+        self._await_answer(client)
         with self._mutex:
             self._flying.clear()
             self._waiting = dict.fromkeys(self._newest)
         self._connected, self._faults = True, {}
         client.publish(f"{self._topic}/alive", "online", 1, True)
+
+    def _await_answer(self, client: Any) -> None:
+        """Until the broker has taken the connection. Raises BrokerLostError."""
+        latest = time.monotonic() + ANSWER_S
+        while self._answer is None:
+            if time.monotonic() > latest:
+                raise BrokerLostError(f"{self._where}: the broker did not answer within {ANSWER_S:g} s")
+            self._turn(client)
 
     def _turn(self, client: Any) -> None:
         """Read and write what can be, for `poll_s` at most. Raises BrokerLostError."""

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import AbstractContextManager, ExitStack, suppress
-from multiprocessing.synchronize import Event
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -20,13 +22,41 @@ from agent.fleet.workers import begin
 
 # Gateways in one process, with two threads each that wake up 15 times a second. docs/fleet.md has what more would cost.
 GATEWAYS_EACH = 100
+LEAVE_S = 5.0  # to end in order, once they are to stop; then a process ends as it is: a router sees its gateways leave
 NICE = 10  # gateways are other machines: simulated ones leave the processor to a router and a monitor on this one
 
 SPAWN = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
 
 _part: SimulatedFleet  # in a process of the fleet: its gateways
-_stop: Event  # and whether they are to stop
+_stop: Stopping  # and whether they are to stop
 Value = TypeVar("Value")
+
+
+class Stopping:
+    """Whether several processes are to stop: a pipe that is never read. It is also set where its maker has ended.
+
+    A handler of signals may call `set` at any moment; an event of threads or processes has a lock, which the code that
+    the signal interrupts may hold.
+    """
+
+    def __init__(self) -> None:
+        self._reader, self._writer = SPAWN.Pipe(duplex=False)
+
+    def set(self) -> None:
+        """Stop, here and in all processes that have got this object."""
+        if not self.is_set():
+            self._writer.send_bytes(b"stop")
+
+    def is_set(self) -> bool:
+        """Whether to stop."""
+        return self._reader.poll()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait for it, for so many s at most; returns whether to stop."""
+        return self._reader.poll(timeout)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_reader": self._reader}  # only its maker has the end that keeps it open
 
 
 class Named(NamedTuple):
@@ -41,28 +71,29 @@ class Named(NamedTuple):
 class FleetProcesses(AbstractContextManager["FleetProcesses"]):
     """`count` gateways with `sensors` sensors each, in processes of at most GATEWAYS_EACH, which open one by one.
 
-    `unconnected`: the number of gateways that found no router. The processes end with this process.
-    Raises EndpointError, StoreError; the methods raise BrokenProcessPool where a process has ended.
+    `unconnected`: the number of gateways that found no router. The processes end with this process, and LEAVE_S after
+    they are to stop. Raises EndpointError, StoreError; the methods raise BrokenProcessPool where a process has ended.
     """
 
     def __init__(
-        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path, stop: Event | None = None
+        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path, stop: Stopping | None = None
     ) -> None:
-        """`stop` is an event of `SPAWN`: once it is set, what is going on ends soon."""
+        """`stop`: once it is set, what is going on ends soon."""
         session_config("client", connect=connect)  # raises EndpointError here rather than in another process
         parts = -(-count // GATEWAYS_EACH)
         self.gateways: list[Named] = []
         self.unconnected = 0
         self._parts: list[ProcessPoolExecutor] = []
-        stop = stop or SPAWN.Event()
+        self._stop = stop or Stopping()
         with ExitStack() as opened:
             for part in range(parts):
                 process = opened.enter_context(
-                    ProcessPoolExecutor(1, mp_context=SPAWN, initializer=_begin, initargs=(stop,))
+                    ProcessPoolExecutor(1, mp_context=SPAWN, initializer=_begin, initargs=(self._stop,))
                 )
                 numbers = range(part, count, parts)
-                gateways, unconnected = process.submit(
-                    _open, count, sensors, seed, connect, data_dir, numbers).result()  # fmt: skip
+                with _without_interrupts():
+                    opening = process.submit(_open, count, sensors, seed, connect, data_dir, numbers)
+                gateways, unconnected = opening.result()
                 opened.callback(_leave, process)
                 self._parts.append(process)
                 self.gateways += gateways
@@ -90,6 +121,7 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
         return sorted(gateway.name for gateway in self.gateways if gateway.behaviour == behaviour)
 
     def __exit__(self, *_: object) -> None:
+        self._stop.set()
         for process in self._parts:  # all at the same time; _leave then waits for each
             with suppress(BrokenProcessPool):
                 process.submit(_close)
@@ -105,12 +137,27 @@ def _leave(process: ProcessPoolExecutor) -> None:
         process.submit(_close).result()
 
 
-def _begin(stop: Event) -> None:
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process that is begun here does not take Ctrl-C of the terminal: it could not answer it before `_begin`."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    yield
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(stop: Stopping) -> None:
     global _stop
     _stop = stop
     Ending().status = 0
     begin()
+    threading.Thread(target=_end_after, args=(stop,), name="end", daemon=True).start()
     os.nice(NICE)
+
+
+def _end_after(stop: Stopping) -> None:
+    stop.wait()
+    time.sleep(LEAVE_S)
+    os._exit(0)
 
 
 def _open(

@@ -11,7 +11,8 @@ import re
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -21,11 +22,12 @@ from agent.delivery.keys import CHUNK, Address
 from calib.model import PARAMETERS
 
 NEEDS_A_PERSON = ("INVALID", "HELD", "UNCALIBRATED")
+CALM = ("running", "catching up")  # states of a gateway that need no person
 LARGEST = 1e6  # change in units of U; a stranger may send numbers whose quotient is not finite
 # A stranger may invent gateways and sensors for ever, so their numbers are bounded: ten times what docs/fleet.md plans.
 SENSORS_MAX = 40_000
 GATEWAYS_MAX = 10_000
-TEXT_MAX = 500  # characters of a reason that are shown; the program's own have some 100
+TEXT_MAX = 800  # characters of a reason that are shown; what explains held windows has some 450
 EVENTS_MAX = 500  # changes of status, verdicts and commands that the page lists, the newest
 LARGEST_TOLD = 16 << 10  # bytes of what a gateway says of itself; with four devices it has 2 kB
 SILENT_INTERVALS = 3  # without a result after which a sensor is not heard
@@ -39,6 +41,8 @@ _MAIN_NAMES = frozenset(PARAMETERS[i] for i in MAIN)
 # Fields of a verdict that a row has.
 VERDICT = ("parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "t_utc_ns",
            "false_alarms_a_year")  # fmt: skip
+# As calib.estimate.state.DATED puts the date of the certificate behind the identity of a reference.
+_CALIBRATED = re.compile(r"(.*), calibrated ([0-9]{4}-[0-9]{2}-[0-9]{2})", re.DOTALL)
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
 Kind = Literal["drifting", "held", "no data", "silent", "uncalibrated", "sound"]
@@ -307,11 +311,14 @@ def _verdicts(newest: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     return [f for part, f in newest.items() if part.startswith("drift ") and f["verdict"] != "stable"]
 
 
-def kind_of(verdicts: int, status: str, *, heard: bool) -> Kind:
-    """The kind of a sensor: what it counts as on the page. `verdicts`: of drifts and steps."""
+def kind_of(verdicts: Collection[str], status: str, *, heard: bool) -> Kind:
+    """The kind of a sensor: what it counts as on the page. `verdicts`: "drifting" or "stepped".
+
+    Held windows are what shows a step, so a sensor that is held and has stepped is held.
+    """
     if not heard:
         return "silent"
-    if verdicts:
+    if "drifting" in verdicts or (verdicts and status != "HELD"):
         return "drifting"
     return _OF_STATUS.get(status, "uncalibrated")
 
@@ -322,6 +329,7 @@ _OF_STATUS: dict[str, Kind] = {"VALID": "sound", "RECALIBRATING": "sound", "HELD
 def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *, heard: bool) -> dict[str, Any]:
     status, calibration = newest.get("status", {}), newest.get("calibration", {})
     verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
+    reference, calibrated_utc_ns = dated(_reference(newest))
     why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
     if status.get("status") in NEEDS_A_PERSON:
         why.insert(0, f"{status['status']}: {status['reason']}")
@@ -333,7 +341,7 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *,
         "site": place[0],
         "gateway": place[1],
         "sensor": place[2],
-        "kind": kind_of(len(verdicts), status.get("status", ""), heard=heard),
+        "kind": kind_of([drift["verdict"] for drift in verdicts], status.get("status", ""), heard=heard),
         "status": status.get("status", ""),
         "status_utc_ns": status.get("t_utc_ns"),
         "reason": clipped(status.get("reason", "")),
@@ -342,7 +350,8 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *,
         "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
         "u_pct": _u_pct(calibration),
         "band_hz": calibration.get("valid_band_hz", []),
-        "reference": clipped(_reference(newest)),
+        "reference": clipped(reference),
+        "calibrated_utc_ns": calibrated_utc_ns,
         "estimate": newest.get("estimate", {}).get("sequence"),
         "estimate_utc_ns": newest.get("estimate", {}).get("t_utc_ns"),
         "last_good_utc_ns": newest.get("good window", {}).get("t_utc_ns"),
@@ -350,6 +359,17 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *,
         "verified": bool(newest) and all(fields.get("signed_by") for fields in newest.values()),
         "why": "; ".join(clipped(reason) for reason in why),
     }
+
+
+def dated(reference: str) -> tuple[str, int | None]:
+    """The reference without the date of its certificate, and this date (UTC, ns); None where it has none."""
+    if (found := _CALIBRATED.fullmatch(reference)) is None:
+        return reference, None
+    try:
+        date = datetime.fromisoformat(found[2]).replace(tzinfo=UTC)
+    except ValueError:  # no date of a calendar
+        return reference, None
+    return found[1], int(date.timestamp()) * 10**9
 
 
 def _u_pct(calibration: Mapping[str, Any]) -> float | None:
@@ -367,7 +387,7 @@ def _gateway_row(
     why = [] if alive else ["the gateway is not on the bus"]
     if instances > 1:
         why.append(f"{instances} gateways are on the bus under this name: stop one of them, or give it another name")
-    if told is not None and told.state != "running":
+    if told is not None and told.state not in CALM:
         why.append(clipped(f"{told.state}: {'; '.join(told.reasons[:10])}"))
     if refused:
         why.append(f"{refused} results in its name were refused: no known key of this gateway signed them")

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 class Since:
     """A change that began on `day`: its size until the last point and rate a day, each with its standard uncertainty.
 
-    A step has the rate 0.
+    A step has the rate 0. `squares`: the least sum of squares that it leaves.
     """
 
     day: float
@@ -40,6 +40,7 @@ class Since:
     u_size: float
     rate: float
     u_rate: float
+    squares: float
 
 
 def since(t_days: Array, values: Array, shape: Literal["drifting", "stepped"]) -> Since | None:
@@ -66,7 +67,7 @@ def since(t_days: Array, values: Array, shape: Literal["drifting", "stepped"]) -
     if abs(size) < CLEAR * u_size:
         return None
     rate, u_rate = _mixed(slopes, variances, weights) if shape == "drifting" else (0.0, 0.0)
-    return Since(day, u_day, size, u_size, rate, u_rate)
+    return Since(day, u_day, size, u_size, rate, u_rate, float(squares.min()))
 
 
 def _independent(residuals: Array) -> float:

@@ -6,13 +6,13 @@ import math
 import re
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from agent.monitor.database import DAY_NS, Database
 from agent.monitor.fleet import MAIN, Fleet, Place
-from agent.monitor.onset import since
+from agent.monitor.onset import Array, Since, since
 from calib.model import PARAMETERS
 
 THINNED = 60  # points of a small plot
@@ -22,6 +22,7 @@ KEPT_FOR_S, KEPT_MAX = 60.0, 2000  # for so long, and of so many sensors, what w
 STATUSES = 200  # changes of status that are looked at
 # Source of a budget that results of one reference share (calib.estimate.quantities).
 OF_REFERENCE = "reference sensitivity"
+Shape = Literal["drifting", "stepped"]
 _ACCEPTED = re.compile(r"(?:estimate [0-9]+ accepted|rolled back) by ")  # as agent.core.gate says it
 
 
@@ -133,6 +134,20 @@ def _lasting(statuses: Sequence[Mapping[str, Any]]) -> int | None:
     return lasting
 
 
+def change_in(days: Array, values: Array, verdict: Mapping[str, Any]) -> tuple[Shape, Since | None]:
+    """The change that the history shows, and whether it is a drift or a step.
+
+    A test of steps also finds a part of a drift. So the other shape than that of the verdict counts where it leaves
+    less than half of the squares, and goes as far in the same direction.
+    """
+    told: Shape = verdict["verdict"]
+    other: Shape = "stepped" if told == "drifting" else "drifting"
+    own, instead = since(days, values, told), since(days, values, other)
+    if instead is None or instead.size * math.copysign(1.0, verdict["change"]) < 0.5 * abs(verdict["change"]):
+        return told, own
+    return (other, instead) if own is None or instead.squares < 0.5 * own.squares else (told, own)
+
+
 def _trend(verdict: Mapping[str, Any], history: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The parameter of a verdict over time, and the `change` that its history shows; None where it shows none."""
     i = PARAMETERS.index(verdict["parameter"])
@@ -140,7 +155,7 @@ def _trend(verdict: Mapping[str, Any], history: Sequence[Mapping[str, Any]]) -> 
     t_utc_ns = [t for t, _, _ in known]
     days, values = np.array(t_utc_ns, dtype=float) / DAY_NS, np.array([v for _, v, _ in known])
     rising = np.append(True, np.diff(days) > 0) if len(days) else np.zeros(0, dtype=bool)
-    change = since(days[rising], values[rising], verdict["verdict"])
+    shape, change = change_in(days[rising], values[rising], verdict)
     thin = _thinned(len(known))
     return {
         "t_utc_ns": [known[k][0] for k in thin],
@@ -149,7 +164,7 @@ def _trend(verdict: Mapping[str, Any], history: Sequence[Mapping[str, Any]]) -> 
         "scale": value_of(history[-1], 4 * (i // 3 if i < 9 else i - 9)),  # the main sensitivity of its output
         "change": change
         and {
-            "onset_utc_ns": round(change.day * DAY_NS), "u_onset_days": change.u_day, "size": change.size,
-            "u_size": change.u_size, "rate": change.rate, "u_rate": change.u_rate,
+            "shape": shape, "onset_utc_ns": round(change.day * DAY_NS), "u_onset_days": change.u_day,
+            "size": change.size, "u_size": change.u_size, "rate": change.rate, "u_rate": change.u_rate,
         },
     }  # fmt: skip

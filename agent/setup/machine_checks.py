@@ -1,4 +1,4 @@
-"""Checks of the machine of a gateway: clock, disk, certificates, router, optional parts."""
+"""Checks of the machine of a gateway: clock, disk, certificates, router, MQTT broker, optional parts."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from agent.config import Config
+from agent.config.key_file import KeyFileError
 from agent.config.knowledge import Certificate
 from agent.config.tls import SOON, expiry_warning
+from agent.delivery.history import FILE_NAME, History
+from agent.delivery.mqtt import MqttPublisher
 from agent.recording.files import recordings
 from agent.setup.extras import extras
 from agent.setup.finding import Finding
-from hw.sensor import Options
+from hw.sensor import ConfigurationError, Options
 
 # adjtimex(2): the kernel's clock state. The structure has 208 bytes on 64-bit Linux; `status` is an int at byte 40, and
 # `maxerror`, a long in us, at byte 24.
@@ -157,6 +160,26 @@ def router_findings(config: Config) -> Iterator[Finding]:
             )  # fmt: skip
         else:
             yield Finding("router", "good", f"{protocol}/{host}:{port} takes connections")
+
+
+def broker_findings(config: Config, data_dir: Path) -> Iterator[Finding]:
+    """Does the MQTT broker take the connection of this gateway, with its user, password and certificate?
+
+    It is tried under another client_id, so that a running agent keeps its connection. Nothing is published.
+    """
+    if not config.mqtt.enabled:
+        return
+    gateway = config.gateway
+    try:
+        publisher = MqttPublisher(gateway.site, gateway.name, config.mqtt, lambda: History(data_dir / FILE_NAME))
+        fault = publisher.attempt(f"fieldcal-doctor-{os.getpid()}")
+    except (ConfigurationError, KeyFileError) as error:
+        fault = str(error)
+    if fault:
+        remedy = "correct the section mqtt, or start the broker; results do not wait for it, the newest are sent later"
+        yield Finding("MQTT broker", "advice", fault, remedy)
+    else:
+        yield Finding("MQTT broker", "good", f"{config.mqtt.host}:{config.mqtt.port} takes the connection")
 
 
 def extra_findings() -> Iterator[Finding]:

@@ -1,10 +1,13 @@
 """A fleet on the bus, the page in a browser, and the pictures of the documentation.
 
-`python -m tests.scenarios.fleet_page` writes docs/images/fleet*.png.
+`python -m tests.scenarios.fleet_page` writes docs/images/fleet*.png. With `--views DIR` it looks at fleet, sensor, plan
+and live at three widths, light and dark: it writes a picture of each of the 24, and says what axe-core finds there and
+what is wider than the window. The exit status is 1 where there is something.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 import time
@@ -23,7 +26,9 @@ from agent.delivery.history import Record
 from agent.delivery.keys import gateway_key
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
-from agent.fleet.simulated import SimulatedFleet
+from agent.fleet.simulated import SimulatedFleet, behaviours
+from agent.fleet.simulated_sensor import Behaviour
+from agent.monitor.settings import Plan
 from agent.recording.acceleration import encode_acceleration
 from tests.unit.browser import Watched, chromium
 from tests.unit.command_desk import GATEWAY, DeskSite
@@ -42,8 +47,12 @@ RESPONSE = [
 DESK, TABLET, PHONE = ({"width": width, "height": 900} for width in (1440, 820, 390))
 VIEWS: dict[str, tuple[dict[str, int], str]] = {
     "fleet": (DESK, "light"), "fleet-dark": (DESK, "dark"), "fleet-tablet": (TABLET, "light"),
-    "fleet-phone": (PHONE, "light"),
+    "fleet-phone": (PHONE, "light"), "fleet-readme": ({"width": 1100, "height": 620}, "light"),
 }  # fmt: skip
+WITH_SENSOR = ("fleet", "fleet-dark")  # of which a picture of a sensor is made too
+COLOURS = 96  # of a picture; more make the file larger and look the same
+SETTLES_MS = 500  # of drawing
+RATE_HZ = 200.0  # of a corrected stream
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
 
@@ -53,25 +62,29 @@ class PageSite:
 
     served: Served
     fleet: SimulatedFleet
+    sensors: int
     made: int = 0
 
     def rounds(self, count: int, every_days: float = 10.0) -> None:
         """Let the fleet make so many rounds of results, the last of all 30 being of today."""
         for _ in range(count):
             # Of a gateway that the monitor meets for the first time it takes the newest results alone.
-            wait_for(lambda: not self.made or len(self.served.fleet.rows()) == len(self.fleet.gateways) * 2)
+            wait_for(lambda: not self.made or len(self.served.fleet.rows()) == self.sensors)
             self.fleet.step(time.time_ns() - round((29 - self.made) * every_days * DAY_NS))
             self.made += 1
 
 
 @contextmanager
-def page_site(site: Site, directory: Path, **options: Any) -> Iterator[PageSite]:
-    """Eight gateways with two sensors each, of which four are odd."""
+def page_site(
+    site: Site, directory: Path, gateways: int = 8, without: tuple[Behaviour, ...] = (), **options: Any
+) -> Iterator[PageSite]:
+    """Gateways with two sensors each, eight of which are odd, but those that behave as in `without`."""
+    numbers = [k for k, behaviour in enumerate(behaviours(gateways, SEED)) if behaviour not in without]
     with (
         Served(site, directory / "monitor", **options) as served,
-        SimulatedFleet(8, 2, SEED, [site.endpoint], directory / "fleet") as fleet,
+        SimulatedFleet(gateways, 2, SEED, [site.endpoint], directory / "fleet", numbers) as fleet,
     ):
-        yield PageSite(served, fleet)
+        yield PageSite(served, fleet, 2 * len(numbers))
 
 
 class CommandedGateway:
@@ -138,28 +151,134 @@ def ask(page: Any) -> list[dict[str, str]]:
     return found
 
 
+class Streaming:
+    """A gateway that publishes the corrected stream of `mems`: a tone along x and noise along y."""
+
+    def __init__(self, site: Site, directory: Path, tone_hz: float = 12.5) -> None:
+        directory.mkdir()
+        self._store = Store(directory)
+        self._publisher = Publisher("site", "gw", [site.endpoint], self._store)
+        self._publisher.start()
+        wait_for(lambda: self._publisher.state().connected)
+        self._random, self._index, self._tone_hz = np.random.default_rng(1), 0, tone_hz
+
+    def block(self, seconds: float) -> None:
+        """The next samples, of so many seconds."""
+        count = round(seconds * RATE_HZ)
+        t = (self._index + np.arange(count)) / RATE_HZ
+        noise = 0.05 * self._random.standard_normal(count)
+        values = np.column_stack([np.sin(2 * np.pi * self._tone_hz * t), noise, 9.8 + 0 * t])
+        block = Acceleration(
+            sensor="mems", t_utc_ns=time.time_ns(), first_index=self._index, rate_hz=RATE_HZ, acceleration=values,
+            covariance=np.eye(3), noise=np.ones(3), determined=np.ones(12, dtype=bool), calibration_run_id="r",
+            calibration_sequence=103, dynamic_only=False, recorded=False,
+            suspect=np.zeros(3, dtype=bool),
+        )  # fmt: skip
+        self._index += count
+        self._publisher.stream("mems", encode_acceleration(1, block))
+
+    def show(self, page: Any) -> None:
+        """Publish until the page has the spectrum of a half minute."""
+        while page.get_by_text("Corrected acceleration by calibration").count() == 0:  # until the monitor listens
+            self.block(0.5)
+            page.wait_for_timeout(100)
+        for _ in range(2):
+            self.block(15.0)
+            page.wait_for_timeout(300)
+        page.get_by_text("Resolution 0.15 Hz").wait_for()
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._publisher.close()
+        self._store.close()
+
+
+def axe_faults(page: Any) -> list[str]:
+    """What axe-core finds in the page."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    return [f"{v['id']}: {v['nodes'][0]['html']:.200}" for v in Axe().run(page).response["violations"]]
+
+
 def write_pictures() -> None:
-    """The page with a fleet of 300 days: the fleet at three widths and dark, a sensor on a desk, light and dark."""
+    """The page with a fleet of 300 days: the fleet at three widths and dark, a sensor on a desk, light and dark.
+
+    Without the gateway that sends hostile texts.
+    """
     site = Site()
-    with tempfile.TemporaryDirectory() as directory, page_site(site, Path(directory)) as shown, chromium() as browser:
+    with (
+        tempfile.TemporaryDirectory() as directory,
+        page_site(site, Path(directory), 12, ("hostile",)) as shown,
+        chromium() as browser,
+    ):
         shown.rounds(30)
         for name, (viewport, scheme) in VIEWS.items():
             watched = Watched(browser, shown.served.address, viewport=viewport, color_scheme=scheme)
             page = watched.open()
             page.locator("#cards svg").first.wait_for()
-            page.wait_for_timeout(500)  # of drawing
-            page.screenshot(path=IMAGES / f"{name}.png")
-            if viewport is not DESK:
-                watched.close()
-                continue
-            page.locator("#cards a").first.click()
-            page.locator("#matrix table").first.wait_for()
-            page.wait_for_timeout(500)
-            page.screenshot(path=IMAGES / f"{name.replace('fleet', 'fleet-sensor')}.png")
+            _photograph(page, IMAGES / f"{name}.png")
+            if name in WITH_SENSOR:
+                page.locator("#cards a").first.click()
+                page.locator("#matrix table").first.wait_for()
+                _photograph(page, IMAGES / f"{name.replace('fleet', 'fleet-sensor')}.png")
             watched.close()
     site.kill()
 
 
+def _photograph(page: Any, path: Path) -> None:
+    from PIL import Image
+
+    page.wait_for_timeout(SETTLES_MS)
+    page.screenshot(path=path)
+    with Image.open(path) as picture:
+        small = picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
+
+
+def look_at_views(directory: Path) -> int:
+    """Pictures of all views into `directory`; returns how many have a fault, which are printed."""
+    directory.mkdir(parents=True, exist_ok=True)
+    site, count = Site(), 0
+    positions = {f"simulated/gw000{k}/s0": (0.1 + 0.1 * k, 0.5) for k in range(8)}
+    with ExitStack() as opened:
+        data = Path(opened.enter_context(tempfile.TemporaryDirectory()))
+        plan = Plan(picture=IMAGES / "report.png", positions=positions)
+        shown = opened.enter_context(page_site(site, data, plan=plan))
+        gateway = Streaming(site, data / "streaming")
+        opened.callback(gateway.close)
+        shown.rounds(12)
+        browser = opened.enter_context(chromium())
+        for viewport, scheme in ((size, scheme) for size in (DESK, TABLET, PHONE) for scheme in ("light", "dark")):
+            watched = Watched(browser, shown.served.address, viewport=viewport, color_scheme=scheme)
+            page = watched.open()
+            page.locator("#cards svg").first.wait_for()
+            count += _look(page, directory, "fleet")
+            page.locator("#cards a", has_text=shown.fleet.names_of("leaning")[0]).first.click()
+            page.locator("#matrix table").first.wait_for()
+            count += _look(page, directory, "sensor")
+            watched.open("#view=plan").locator("#plan-picture .point").first.wait_for()
+            count += _look(page, directory, "plan")
+            gateway.show(watched.open("#view=live&site=site&gateway=gw&sensor=mems"))
+            count += _look(page, directory, "live")
+            watched.close()
+    site.kill()
+    return count
+
+
+def _look(page: Any, directory: Path, view: str) -> bool:
+    page.wait_for_timeout(SETTLES_MS)
+    width, dark = page.viewport_size["width"], page.evaluate("() => matchMedia('(prefers-color-scheme: dark)').matches")
+    name = f"{view}-{width}-{'dark' if dark else 'light'}"
+    page.screenshot(path=directory / f"{name}.png", full_page=True)
+    faults = axe_faults(page)
+    if (wide := page.evaluate("() => document.documentElement.scrollWidth")) > width:
+        faults.append(f"it is {wide} px wide")
+    print(f"{name}: {'; '.join(faults) or 'no fault'}", flush=True)
+    return bool(faults)
+
+
 if __name__ == "__main__":
-    write_pictures()
-    sys.exit(0)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--views", type=Path, metavar="DIR", help="pictures of all views, and what axe-core finds")
+    args = parser.parse_args()
+    sys.exit(write_pictures() if args.views is None else look_at_views(args.views) > 0)

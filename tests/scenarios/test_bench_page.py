@@ -19,8 +19,8 @@ pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 pytest.importorskip("argon2", reason="the extra monitor is not installed")
 from tests.scenarios.bench_page import RECORD, VIEW, session
+from tests.scenarios.fleet_page import axe_faults
 from tests.scenarios.processes import ROOT
-from tests.scenarios.test_fleet_page import faults
 from tests.unit.monitor_site import Monitor
 
 pytestmark = needs_chromium
@@ -62,7 +62,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
                 texts = page.locator("#bench-warnings li").all_inner_texts()
                 assert [re.sub(r"^Stop [12]: ", "", text) for text in texts] == warned
                 assert texts[-1].startswith("Stop 2: ")
-                assert faults(page) == []
+                assert axe_faults(page) == []
             if (taken := re.search(r"stop 1, (.*): U is now", told)) is not None:  # the page told U in each second
                 stay = re.compile(rf"At {taken[1]}[2-9] s of 4 to 60 s; U will be \d")
                 assert any(map(stay.match, page.evaluate("() => window.seen")))
@@ -86,7 +86,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
         ]
         assert page.locator("#bench-silent").inner_text() == ""
         assert page.locator("#bench-plot .uplot").count() == 1
-        assert faults(page) == []
+        assert axe_faults(page) == []
         saved = monitor.get("bench.csv?site=virtual&gateway=bench").splitlines()
         assert saved[0] == "stop,position,u_main_pct,u_transverse_pct"
         assert [line.split(",")[1] for line in saved[1:]] == [row[1] for row in now]
@@ -94,7 +94,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 390
         page.emulate_media(color_scheme="dark")
         page.wait_for_function("() => getComputedStyle(document.body).backgroundColor === 'rgb(15, 21, 27)'")
-        assert faults(page) == []
+        assert axe_faults(page) == []
         watched.close()  # no request to outside, no error
     finally:
         monitor.stop()

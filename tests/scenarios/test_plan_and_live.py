@@ -10,24 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.core.events import Acceleration
-from agent.delivery.publication import Publisher
-from agent.delivery.store import Store
-from agent.recording.acceleration import encode_acceleration
 from tests.unit.browser import Watched, chromium, needs_chromium
 from tests.unit.zenoh_site import Site, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 pytest.importorskip("argon2", reason="the extra monitor is not installed")
+pytest.importorskip("axe_playwright_python", reason="axe is not installed")
 from agent.monitor.users import set_user
+from tests.scenarios.fleet_page import Streaming, axe_faults
 from tests.unit.monitor_site import Served
 
 pytestmark = needs_chromium
 PASSWORD = "correct horse battery staple"
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "report.png"
 STATUSES = {"deck-1": "VALID", "deck-2": "HELD", "deck-3": "INVALID", "<b>4": "VALID"}
-RATE_HZ, TONE_HZ = 200.0, 12.5
 
 
 @pytest.fixture(scope="module")
@@ -50,12 +47,6 @@ def log_in(watched: Watched, name: str, view: str) -> Any:
     page.get_by_label("Password").fill(PASSWORD)
     page.get_by_role("button", name="Log in").click()
     return page
-
-
-def serious_faults(page: Any) -> list[str]:
-    """What axe-core finds in the page."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed").Axe()
-    return [f"{v['id']}: {v['nodes'][0]['html']:.200}" for v in axe.run(page).response["violations"]]
 
 
 def test_a_person_puts_sensors_on_the_plan(site: Site, tmp_path: Path, browser: Any) -> None:
@@ -98,7 +89,7 @@ def test_a_person_puts_sensors_on_the_plan(site: Site, tmp_path: Path, browser: 
             "point ok", "point warn",
         ]  # fmt: skip
         assert page.locator("#plan img").count() == 1  # texts of the bus are no elements
-        assert serious_faults(page) == []
+        assert axe_faults(page) == []
         page.get_by_role("button", name="Arrange sensors").click()
         page.locator("#plan-picture .point").first.press("Enter")
         page.wait_for_function("() => location.hash.includes('sensor=deck-1')")
@@ -110,39 +101,6 @@ def test_a_person_puts_sensors_on_the_plan(site: Site, tmp_path: Path, browser: 
         reader.close()
 
 
-class Streaming:
-    """A gateway that publishes the corrected stream of `mems`: a tone along x and noise along y."""
-
-    def __init__(self, site: Site, directory: Path) -> None:
-        directory.mkdir()
-        self._store = Store(directory)
-        self._publisher = Publisher("site", "gw", [site.endpoint], self._store)
-        self._publisher.start()
-        wait_for(lambda: self._publisher.state().connected)
-        self._random, self._index = np.random.default_rng(1), 0
-
-    def block(self, seconds: float) -> None:
-        """The next samples, of so many seconds."""
-        count = round(seconds * RATE_HZ)
-        t = (self._index + np.arange(count)) / RATE_HZ
-        values = np.column_stack(
-            [np.sin(2 * np.pi * TONE_HZ * t), 0.05 * self._random.standard_normal(count), 9.8 + 0 * t]
-        )
-        block = Acceleration(
-            sensor="mems", t_utc_ns=time.time_ns(), first_index=self._index, rate_hz=RATE_HZ, acceleration=values,
-            covariance=np.eye(3), noise=np.ones(3), determined=np.ones(12, dtype=bool), calibration_run_id="r",
-            calibration_sequence=103, dynamic_only=False, recorded=False,
-            suspect=np.zeros(3, dtype=bool),
-        )  # fmt: skip
-        self._index += count
-        self._publisher.stream("mems", encode_acceleration(1, block))
-
-    def close(self) -> None:
-        """Leave the bus."""
-        self._publisher.close()
-        self._store.close()
-
-
 def test_the_signal_is_shown_with_its_spectrum_and_ends_when_nobody_looks(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:
@@ -152,18 +110,14 @@ def test_the_signal_is_shown_with_its_spectrum_and_ends_when_nobody_looks(
             watched = Watched(browser, served.address)
             page = watched.open("#view=live&site=site&gateway=gw&sensor=mems")
             page.get_by_text("Waiting for a block.").wait_for()
-            shown = page.get_by_text("Corrected acceleration by calibration 103, 200 Hz. Means of the newest block: x")
-            while not shown.is_visible():  # until the monitor listens
-                gateway.block(0.5)
-                page.wait_for_timeout(100)
-            for _ in range(2):
-                gateway.block(15.0)
-                page.wait_for_timeout(300)
-            page.get_by_text("Resolution 0.15 Hz").wait_for()
+            gateway.show(page)
+            page.get_by_text(
+                "Corrected acceleration by calibration 103, 200 Hz. Means of the newest block: x"
+            ).wait_for()
             assert page.locator("#live .uplot").count() == 3
             page.get_by_label("Spectrum in").select_option("amplitude")
             page.get_by_text("Power spectral density, (m/s²)/√Hz").wait_for()
-            assert serious_faults(page) == []
+            assert axe_faults(page) == []
             assert served.live.streams == 1
             page.get_by_role("button", name="Stop").click()
             wait_for(lambda: served.live.streams == 0)

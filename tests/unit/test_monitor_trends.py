@@ -14,9 +14,10 @@ from agent.delivery.keys import Address
 from agent.delivery.received import Received
 from agent.monitor.database import DAY_NS, Database
 from agent.monitor.engines import Sqlite
-from agent.monitor.fleet import Fleet
+from agent.monitor.fleet import Fleet, dated
 from agent.monitor.onset import since
-from agent.monitor.trends import Trends, change_of
+from agent.monitor.trends import Trends, change_in, change_of
+from calib.estimate.state import DATED
 from tests.unit.results import calibration, status
 
 PLACE = ("site", "gw", "mems")
@@ -60,6 +61,16 @@ def test_the_interval_of_an_onset_has_it(shape: Literal["drifting", "stepped"], 
     assert len(inside) > 195
     assert np.min(np.mean(inside, axis=0)) >= 0.9
     assert np.median(u_days) < (15.0 if shape == "drifting" else 3.0)
+
+
+def test_a_step_is_told_from_a_drift_and_a_verdict_that_the_history_does_not_show_stands() -> None:
+    random, days = np.random.default_rng(6), np.arange(100.0)
+    noise = random.normal(size=100)
+    for told in ("drifting", "stepped"):
+        shape, found = change_in(days, noise + 20.0 * (days > 60.0), {"verdict": told, "change": 20.0})
+        assert (shape, found is not None and abs(found.size - 20.0) < 1.0) == ("stepped", True)
+        # As where windows are held: what is in force does not follow, and a slight rise in it is no explanation.
+        assert change_in(days, noise + 0.02 * days, {"verdict": told, "change": 100.0})[0] == told
 
 
 def test_a_sound_history_shows_no_change() -> None:
@@ -117,6 +128,35 @@ def test_colours_come_from_verdicts_and_hearing_alone() -> None:
     assert kind(fleet) == "no data"
 
 
+def test_a_sensor_that_is_held_and_has_stepped_is_held() -> None:
+    fleet = Fleet(Clock())
+    fleet.set_alive("site", "gw", True)
+    fleet.take(*PLACE, "status", fields_of(status(1, "HELD")))
+    fleet.take(*PLACE, "drift", verdict(verdict="stepped"))
+    assert kind(fleet) == "held"
+    (row,) = fleet.rows()
+    assert [v["verdict"] for v in row["verdicts"]] == ["stepped"]  # with its step
+    fleet.take(*PLACE, "status", fields_of(status(2, "VALID")))
+    assert kind(fleet) == "drifting"  # an adopted step needs a person too
+
+
+def test_a_gateway_that_catches_up_needs_no_person() -> None:
+    fleet = Fleet(Clock())
+    fleet.set_alive("site", "gw", True)
+    whys = []
+    for state in ("running", "catching up", "degraded"):
+        fleet.set_told("site", "gw", msgspec.json.encode({"state": state, "reasons": ["a reason"], "t_utc_ns": 1}))
+        whys += [row["why"] for row in fleet.gateways({})]
+    assert whys == ["", "", "degraded: a reason"]
+
+
+def test_the_date_of_a_certificate_is_read_from_the_identity_of_the_reference() -> None:
+    day_ns = 1_772_323_200_000_000_000  # 2026-03-01, midnight UTC
+    assert dated(f"B12 4711 3c9fa15d91c5{DATED}2026-03-01") == ("B12 4711 3c9fa15d91c5", day_ns)
+    for other in ("B12 4711", f"B12{DATED}2026-02-30", f"B12{DATED}soon", ""):
+        assert dated(other) == (other, None)
+
+
 def test_a_sensor_that_misses_three_intervals_is_not_heard() -> None:
     now = Clock()
     fleet = Fleet(now)
@@ -148,8 +188,12 @@ def test_rows_that_have_not_changed_are_not_sent_again_and_events_are_told_once(
     assert [(event["sensor"], event["count"]) for event in fleet.events()] == [("b", 2), ("b", 1), ("a", 1)]
 
 
-def test_what_a_history_tells_of_a_drift(tmp_path: Path) -> None:
-    """A year, each fifth day a calibration; Sxx rises from day 200 on, after an operator accepted that of day 100."""
+@pytest.mark.parametrize("told", ["drifting", "stepped"])
+def test_what_a_history_tells_of_a_drift(tmp_path: Path, told: str) -> None:
+    """A year, each fifth day a calibration; Sxx rises from day 200 on, after an operator accepted that of day 100.
+
+    It is a drift also where the newest verdict is that a part of it was a step.
+    """
     fleet, database = Fleet(), Database(Sqlite(tmp_path / "monitor.sqlite"), full_days=1000)
     begin, random = NOW_NS - 365 * DAY_NS, np.random.default_rng(5)
 
@@ -164,13 +208,14 @@ def test_what_a_history_tells_of_a_drift(tmp_path: Path) -> None:
         if k == 20:
             accepted = status(1, reason="estimate 7 accepted by anna")
             take("status", 10 * k + 2, begin + 5 * k * DAY_NS - 1, fields_of(accepted))
-    take("drift", 999, NOW_NS, verdict())
+    take("drift", 999, NOW_NS, verdict(verdict=told))
     found = Trends(database, fleet).of(PLACE)
     database.close()
     assert (found["accepted"], found["accepted_utc_ns"]) == (True, begin + 100 * DAY_NS)
     assert len(found["t_utc_ns"]) == 60
     assert found["main_pct"][0][-1] == pytest.approx(1.65, abs=0.05)
     change = found["found"]["Sxx"]["change"]
+    assert change["shape"] == "drifting"
     assert abs(change["onset_utc_ns"] / DAY_NS - begin / DAY_NS - 200) < 2 * change["u_onset_days"] < 5
     assert abs(change["rate"] - 2.615) < 2 * change["u_rate"]
     assert abs(change["size"] - 2.615 * 165) < 3 * change["u_size"]

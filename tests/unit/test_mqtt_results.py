@@ -21,6 +21,7 @@ from agent.config.key_file import KeyFileError
 from agent.delivery.mqtt import FLYING_MAX, MqttPublisher
 from agent.delivery.store import Store
 from agent.keys.certificates import issue, make_authority
+from agent.setup.machine_checks import broker_findings
 from calib.model import PARAMETERS
 from tests.unit.broker import OPEN, Broker, Subscriber, free_port, needs_mosquitto
 from tests.unit.zenoh_site import record, wait_for
@@ -174,6 +175,36 @@ def test_password_rights_and_limits_of_the_broker(tmp_path: Path, make: Make) ->
         assert "the broker refuses it: Not authorized; correct" in publisher._faults[f"{TOP}/spare/window"]
         wait_for(lambda: settled(publisher))
         assert publisher.state().refused == 3  # with `alive`
+    finally:
+        guarded.kill()
+
+
+@needs_mosquitto
+def test_doctor_tries_the_broker_beside_a_running_agent(tmp_path: Path, broker: Broker, make: Make) -> None:
+    def found(broker: Broker, **more: Any) -> tuple[str, str]:
+        mqtt = {"enabled": True, "port": broker.port, **more}
+        config = parse_config({"gateway": {"site": "site", "name": "gw"}, "mqtt": mqtt}, "")
+        (finding,) = broker_findings(config, tmp_path)
+        return finding.verdict, finding.says
+
+    (tmp_path / "password").write_text("wrong\n")
+    (tmp_path / "password").chmod(0o600)
+    assert found(broker) == (
+        "advice", f"localhost:{broker.port}: the broker cannot be reached: Connection refused; correct mqtt.host and "
+        "mqtt.port")  # fmt: skip
+    watching = Subscriber(broker.start())
+    agent = make()
+    wait_for(lambda: settled(agent))
+    assert found(broker) == ("good", f"localhost:{broker.port} takes the connection")
+    agent.publish(record(1, "window"))
+    wait_for(lambda: bool(watching.of(f"{TOP}/mems/window")))
+    assert watching.of(f"{TOP}/alive") == [b"online"]  # the agent has kept its connection, and no will came
+    watching.close()
+    (tmp_path / "none").touch(mode=0o644)
+    guarded = Broker(tmp_path, f"allow_anonymous false\npassword_file {tmp_path}/none\n").start()
+    try:
+        verdict, says = found(guarded, username="gw", password_file=str(tmp_path / "password"))
+        assert (verdict, "correct mqtt.username and mqtt.password_file" in says) == ("advice", True)
     finally:
         guarded.kill()
 

@@ -3,7 +3,7 @@ import { $, clean, full, get, make, placeOf, table, text, view } from "./common.
 import { ago, AXES, band, day, DAY_NS, finite, MAIN, now, signed, two } from "./format.js";
 import { card, chip, KINDS, spark, tile } from "./parts.js";
 import { saveTable } from "./picture.js";
-import { cardPlot, steps, told as toldOf } from "./words.js";
+import { cardPlot, certificate, shortName, stateOf, steps, timeOf, told as toldOf } from "./words.js";
 
 const WORST = ["drifting", "held", "no data", "silent", "uncalibrated"]; // kinds that need a person, the worst first
 const CARDS = 5; // that are shown at once; more by a button
@@ -133,9 +133,9 @@ class Row {
     this.shown = row.kind;
     put(this.cells.u, finite(row.u_pct) ? `± ${two(row.u_pct)} %` : "");
     put(this.cells.band, band(row.band_hz));
-    put(this.cells.good, row.kind === "silent" ? `not heard for ${ago(row.heard_utc_ns)}` : ago(row.last_good_utc_ns));
-    this.name = row.reference;
-    if (!this.known) put(this.cells.reference, row.reference);
+    put(this.cells.good, row.kind === "silent" ? `not heard for ${ago(row.heard_utc_ns)}` : ago(row.last_good_utc_ns, timeOf(row)));
+    this.row = row;
+    this.refer();
   }
 
   history(told) {
@@ -148,8 +148,15 @@ class Row {
     const U = most && Math.abs((most.pct * most.U) / most.change);
     put(this.cells.change, most ? `${signed(most.pct, finite(U) && U > 0 ? U : 0.01)} %` : "");
     put(this.cells.over, most ? `${(Math.abs(most.change) / most.U).toFixed(1)} U` : "");
-    const since = told.certificate_utc_ns;
-    this.cells.reference.replaceChildren(text(this.name), ...(since ? [make("span", [", certificate in use since ", day(since)], { class: "hint" })] : []));
+    this.refer();
+  }
+
+  refer() {
+    const told = certificate(this.row, this.known?.certificate_utc_ns), key = `${this.row.reference} ${told.map((part) => part.textContent ?? part).join("")}`;
+    if (this.referred === key) return;
+    this.referred = key;
+    this.cells.reference.replaceChildren(text(shortName(this.row.reference)), ...(told.length ? [make("span", [", ", ...told], { class: "hint" })] : []));
+    this.cells.reference.title = this.row.reference;
   }
 }
 
@@ -213,7 +220,7 @@ function showTable(sensors, gateways, filter) {
     if (many) size(group);
     put(group.button.children[0], `${rows[0].site} / ${rows[0].gateway}`);
     const state = states.get(name);
-    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? state.state || "on the bus" : "not on the bus"}`);
+    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? stateOf(state) : "not on the bus"}`);
     if (group.built || group.seen) fill(group);
   }
   $("sensors").setAttribute("aria-rowcount", String(sensors.length));

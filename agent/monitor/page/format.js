@@ -35,7 +35,7 @@ export function duration(ns) {
 let behind = 0; // ns by which this machine's clock is behind the monitor's
 export const setNow = (ns) => { behind = ns - Date.now() * 1e6; };
 export const now = () => Date.now() * 1e6 + behind;
-export const ago = (ns) => (ns ? duration(now() - ns) : "never");
+export const ago = (ns, at = now()) => (ns ? duration(at - ns) : "never");
 
 // A stranger may send times that no date can hold.
 const held = (ns) => finite(ns) && Math.abs(ns) < 8e21;

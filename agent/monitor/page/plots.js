@@ -42,7 +42,7 @@ export class TimePlots {
         series.push({ edge: true, stroke: "transparent", points: { show: false } });
         data.push(values.map((v, j) => (finite(v) && finite(u[j]) ? v + k * u[j] : null)));
       }
-      bands.push({ series: [at + 1, at + 2], fill: `${colour}26` });
+      bands.push({ series: [at + 1, at + 2], fill: `${colour}1c` });
     }
     box.setAttribute("aria-label", `${one.title} over time`);
     box.replaceChildren();
@@ -50,7 +50,7 @@ export class TimePlots {
       width: width(box), height: one.height, cursor: { sync: { key: "time" }, y: false }, legend: { live: true },
       axes: [axis, { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => `${signed(v, 10 * (ticks[1] - ticks[0] || 1))}${one.unit}`) }],
       series, bands, padding: [12, 12, null, null],
-      scales: { y: { range: (_, low, high) => [Math.min(low, -one.digit), Math.max(high, one.digit)] } },
+      scales: { y: { range: (_, low, high) => rangeOf(one, low, high) } },
       hooks: { draw: [(made) => drawMarks(made, one.marks ?? [])], setScale: [(made, key) => key === "x" && this.zoomed(made)] },
     }, data, box);
     [...box.querySelectorAll(".u-series")].forEach((label, i) => { label.hidden = Boolean(series[i].edge); });
@@ -84,6 +84,13 @@ export class TimePlots {
   }
 }
 
+// The range of a plot with values from `low` to `high`: it may cut a band that is far wider than nine tenths of it are.
+function rangeOf({ series, digit }, low, high) {
+  const ends = [-2, 2].map((k) => series.flatMap(({ values, u }) => values.map((v, j) => v + k * (u?.[j] ?? 0)).filter(finite)).sort((a, b) => k * (a - b)));
+  const [least, most] = ends.map((sorted) => sorted[Math.floor(0.9 * (sorted.length - 1))] ?? 0), all = series.flatMap(({ values }) => values.filter(finite)), reach = most - least;
+  return [Math.max(low, Math.min(least - reach, ...all)), Math.min(high, Math.max(most + reach, ...all))].map((end, i) => (i ? Math.max(end, digit) : Math.min(end, -digit)));
+}
+
 // Dashed lines with their words: where a drift or a step began, a reference was exchanged, the agent began anew.
 function drawMarks(plot, marks) {
   const { ctx, bbox } = plot, size = 11 * devicePixelRatio;
@@ -108,19 +115,21 @@ function drawMarks(plot, marks) {
 
 // Curves {label, values, u} over one axis of x; `log`: a logarithmic axis of frequency; `time`: x is s of UTC.
 export function curves(box, title, x, series, log, time = false, height = 240) {
-  const axis = axisOf(), COLOURS = colours(), drawn = [{}], data = [x], bands = [];
+  const axis = axisOf(), COLOURS = colours(), drawn = [time ? {} : { label: "Hz" }], data = [x], bands = [];
   series.forEach((one, i) => {
     drawn.push({ label: one.label, stroke: COLOURS[i], width: one.u ? 2 : 1, points: { show: x.length < 60 } });
     data.push(one.values);
     if (!one.u) return;
     for (const k of [2, -2]) {
-      drawn.push({ label: `${one.label} ${k > 0 ? "+" : "-"}U`, stroke: `${COLOURS[i]}66`, points: { show: false } });
+      drawn.push({ edge: true, stroke: "transparent", points: { show: false } });
       data.push(one.values.map((v, j) => v + k * one.u[j]));
     }
     bands.push({ series: [drawn.length - 2, drawn.length - 1], fill: `${COLOURS[i]}22` });
   });
   box.replaceChildren();
-  return new uPlot({ title, width: width(box), height, axes: [axis, { ...axis, size: 70 }], scales: { x: { time, distr: log ? 3 : 1 } }, series: drawn, bands, cursor: { drag: { setScale: !log } } }, data, box);
+  const plot = new uPlot({ title, width: width(box), height, axes: [axis, { ...axis, size: 70 }], scales: { x: { time, distr: log ? 3 : 1 } }, series: drawn, bands, cursor: { drag: { setScale: !log } } }, data, box);
+  [...box.querySelectorAll(".u-series")].forEach((label, i) => { label.hidden = Boolean(drawn[i].edge); });
+  return plot;
 }
 
 // U after each stop on a logarithmic axis, with what is wanted as dashed lines.

@@ -6,7 +6,7 @@ import { ago, AXES, band, day, finite, MAIN, moment, NAMES, plusMinus, rounded, 
 import { bars, chip } from "./parts.js";
 import { savePlots } from "./picture.js";
 import { boxOf, curves, TimePlots } from "./plots.js";
-import { steps, told as toldOf } from "./words.js";
+import { certificate, explanation, shortName, steps, told as toldOf } from "./words.js";
 
 const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
 const KINDS = ["calibration", "window", "drift", "status", "estimate", "clock"];
@@ -85,7 +85,7 @@ function showMatrix(newest, row, trends) {
   };
   const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
   const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);
-  const Q = AXES.map((axis, i) => make("td", [plusMinus(newest.offset[i], 2 * newest.standard_uncertainty[9 + i])], { title: `Q${axis}`, class: moved.has(`Q${axis}`) ? "moved" : "" }));
+  const Q = AXES.map((axis, i) => make("td", [rounded(newest.offset[i], 2 * newest.standard_uncertainty[9 + i]), make("small", `± ${two(2 * newest.standard_uncertainty[9 + i])}`)], { title: `Q${axis}`, class: moved.has(`Q${axis}`) ? "moved" : "" }));
   const at = [`At ${two(newest.reference_frequency_hz)} Hz`, newest.valid_band_hz?.length === 2 ? `; right within U/3 from ${band(newest.valid_band_hz)}` : "", ". U with k = 2 below each value; “moved”: its change since the accepted calibration over U of that change."];
   $("matrix").replaceChildren(make("table", [make("caption", "S in force", { class: "hidden" }), make("thead", head), make("tbody", rows)], { class: "matrix" }),
     make("table", [make("caption", `Offset Q, ${clean(newest.output_unit)}`), make("tbody", make("tr", Q))], { class: "matrix" }), make("p", at, { class: "hint" }));
@@ -101,15 +101,32 @@ function showBudget(newest, row, trends) {
   $("budget").replaceChildren(bars([...shares.filter(([, s]) => s >= BUDGET_LEAST), ...rest]));
 }
 
+function certified(row, trends) {
+  const age = row ? certificate(row, trends.certificate_utc_ns) : [];
+  return age.length ? [["Certificate", make("span", [...(row.calibrated_utc_ns ? ["of ", day(row.calibrated_utc_ns), ", "] : []), ...age])]] : [];
+}
+
 function showDevice(row, newest, clocks, trends) {
   const clock = clocks.filter((c) => c.role === "sensor").at(-1), ppm = clock && 1e6 * (clock.rate_hz / clock.nominal_rate_hz - 1);
   const lines = [
     newest && ["Sensor", newest.identity], clock && ["Rate", `${short(clock.rate_hz)} Hz, clock ${two(ppm)} ppm`], clock && finite(clock.lag_s) && ["Lag", `${plusMinus(1000 * clock.lag_s, 2000 * clock.u_lag_s)} ms`],
     newest && finite(newest.temperature_low_degc) && ["Temperature", `${two(newest.temperature_low_degc)} to ${two(newest.temperature_high_degc)} °C calibrated, S and Q at ${short(newest.reference_temperature_degc)} °C`],
-    newest && ["References", newest.references.join("; ") || "none"], trends.certificate_utc_ns && ["Certificate", make("span", ["in use since ", day(trends.certificate_utc_ns), ` (${ago(trends.certificate_utc_ns)})`])],
+    newest && ["Reference", row?.reference ? shortName(row.reference) : "none"], ...certified(row, trends),
     row && ["Last good window", `${ago(row.last_good_utc_ns)} ago`], newest && ["Result", newest.signed_by ? `signed with the key ${newest.signed_by}` : "not verified"],
   ].filter(Boolean);
   $("device").replaceChildren(make("dl", lines.flatMap(([title, told]) => [make("dt", title), make("dd", told)]), { class: "facts" }));
+}
+
+// The hypotheses about windows that stay held: the newest that the agent has told since they are.
+function showHypotheses(row, statuses) {
+  const told = statuses.slice(statuses.findLastIndex((s) => s.status !== "HELD") + 1).findLast((s) => explanation(s.reason)), why = row?.status === "HELD" && told ? explanation(told.reason) : null;
+  $("hypotheses-card").hidden = !why;
+  if (!why) return;
+  const best = why.best ? [[why.best, why.least, why.none - why.least]] : [];
+  const alike = why.alike.map((each) => [each, "as well", ""]);
+  const fit = why.best && !why.fits ? "The best is not within what chance allows. " : !why.best ? "No known explanation fits. " : "";
+  $("hypotheses").replaceChildren(table("Explanations", ["Another…", "χ²", "smaller by"], [["none: no change", why.none, ""], ...best, ...alike]),
+    make("p", [`Of ${why.held} held windows, told `, moment(told.t_utc_ns), `; χ² (chi-squared) is ${why.limit} at most if an explanation is right. ${fit}Those that differ by less than 10 are not told apart. The agent states no prior odds.`], { class: "hint" }));
 }
 
 // Each event once, with how often it was told; numbers that differ make no other event.
@@ -231,6 +248,7 @@ export async function show(told, go) {
     showMatrix(newest, row, trends);
     showBudget(newest, row, trends);
     showDevice(row, newest, found.clock, trends);
+    showHypotheses(row, found.status);
     showEvents(found.status, found.drift, found.estimate);
     refold(sections(place, found, whole, hours, later));
     for (const draw of later) draw();

@@ -1,7 +1,7 @@
 // What is said of a sensor: its verdicts in sentences, what else is steady, and what a person can do.
 import { commandLine } from "./commands.js";
 import { make } from "./common.js";
-import { AXES, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
+import { ago, AXES, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
 import { copier, spark } from "./parts.js";
 
 const LEAST_PCT = 0.2; // half the range of a small plot at least, so that noise is not made large
@@ -24,7 +24,7 @@ export function sentence(verdict, trend) {
   const of = change ?? { size: verdict.change, u_size: verdict.u_change, rate: verdict.rate, u_rate: verdict.u_rate, onset_utc_ns: verdict.onset_utc_ns };
   const size = pair(of.size * factor, 2 * of.u_size * factor, unit), since = [day(of.onset_utc_ns), spread(of.u_onset_days)];
   const told = change ? "." : ["; told on ", day(verdict.t_utc_ns), "."];
-  if (verdict.verdict === "stepped") return [name, of.size < 0 ? " fell by " : " rose by ", ...size, " at once, on ", ...since, told].flat();
+  if ((change?.shape ?? verdict.verdict) === "stepped") return [name, of.size < 0 ? " fell by " : " rose by ", ...size, " at once, on ", ...since, told].flat();
   const days = Math.abs(of.rate * factor * MONTH_DAYS) < 0.1 ? [YEAR_DAYS, "year"] : [MONTH_DAYS, "month"];
   const rate = pair(of.rate * factor * days[0], 2 * of.u_rate * factor * days[0], unit);
   return [name, of.rate < 0 ? " falls by " : " rises by ", ...rate, ` a ${days[1]}, `, ...size, " since ", ...since, told].flat();
@@ -49,16 +49,55 @@ function cause(beside) {
   return beside.changed * 2 >= beside.count ? `Only ${others}: look at the reference first.` : `${others}: rather this sensor than its reference.`;
 }
 
+// The time of a sensor's gateway: that of its newest result while it catches up, as a simulated one may.
+const catchesUp = (state) => state === "catching up";
+export const timeOf = (row) => (catchesUp(row.gateway_state) ? row.result_utc_ns : now());
+// The state of a gateway in words.
+export const stateOf = (gateway) => (catchesUp(gateway.state) ? `catching up, now at ${day(gateway.told_utc_ns).textContent}` : gateway.state || "on the bus");
+
+// A reference without the digest of its settings.
+export const shortName = (reference) => reference.replace(/ [0-9a-f]{12}$/, "");
+// The age of the certificate of its reference; where it states no date, since when it is in use.
+export function certificate(row, inUse_utc_ns) {
+  if (row.calibrated_utc_ns) return [ago(row.calibrated_utc_ns, timeOf(row)), " old"];
+  return inUse_utc_ns ? ["without a date, in use since ", day(inUse_utc_ns)] : [];
+}
+
+// What the agent (agent.core.explaining) says of windows that stay held, in its parts; null where it says something else.
+const EXPLAINED = /^(?<held>\d+) held windows contradict the state: chi-squared (?<none>\d+), (?<limit>\d+) at most if it is right\. (?:(?<how>Best fits|Nearest, though not within what chance allows, is) another (?<best>.+?): chi-squared (?<least>\d+), \S+ times smaller\.(?: As well fits: (?<alike>.+?)\.(?= [A-Z]))? )?(?<todo>[^]+)$/;
+export function explanation(reason) {
+  const found = EXPLAINED.exec(reason)?.groups;
+  if (!found) return null;
+  const alike = found.alike?.split("; ").map((each) => each.replace(/^another /, "")) ?? [];
+  return { held: Number(found.held), none: Number(found.none), limit: Number(found.limit), fits: found.how === "Best fits", best: found.best ?? "", least: Number(found.least), alike, todo: found.todo };
+}
+
+const inWords = ({ best, alike, fits, least, none }) => (!best ? "No known explanation fits them." : `${fits ? "Explained best by" : "Nearest, but not within what chance allows:"} another ${[best, ...alike].join(", or another ")}: chi-squared ${least} in place of ${none}.`);
+
+// {say, more} of a sensor that is held, perhaps with a step.
+function heldWords(row, verdicts, trends) {
+  const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason), kept = trends?.accepted_utc_ns ? [" The calibration before stays in force."] : [];
+  const reason = why ? [`${why.held} windows contradict the calibration.`] : [row.reason, "."];
+  return { say: [...since, ...(verdicts.length ? verdicts.flatMap((v) => [...v, " "]) : reason)], more: [...(why ? [inWords(why)] : verdicts.length ? reason : []), ...kept] };
+}
+
 // {say, more} of a sensor that is not in order.
 export function told(row, trends) {
   const verdicts = row.verdicts.map((v) => sentence(v, trends?.found?.[v.parameter]));
   const reason = row.reason ? [row.reason, "."] : [], since = trends?.held_utc_ns ?? row.status_utc_ns;
   if (row.kind === "silent") return { say: ["Not heard since ", make("b", moment(row.heard_utc_ns)), ` (${duration(now() - row.heard_utc_ns)}). Its calibration was ${row.status || "not known"} then; nobody knows now.`], more: verdicts.flatMap((v) => ["Before: ", ...v, " "]) };
+  if (row.kind === "held") return heldWords(row, verdicts, trends);
   if (verdicts.length) return { say: verdicts.flatMap((v) => [...v, " "]), more: [often(row.verdicts[0]), " ", ...steady(row), cause(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
-  if (row.kind === "held") return { say: ["Held since ", make("b", moment(since)), ": ", ...reason], more: trends?.accepted_utc_ns ? ["The calibration before stays in force."] : [] };
   if (row.kind === "no data") return { say: ["No data since ", make("b", moment(since)), ": ", ...reason], more: ["What is in force was right then."] };
   if (row.kind === "uncalibrated") return { say: [row.status === "COLLECTING" ? "Windows are being collected: " : "No calibration is in force: ", ...reason], more: [] };
   return { say: ["No drift and no step is found", row.last_good_utc_ns ? [". The last good window is of ", moment(row.last_good_utc_ns)] : "", "."].flat(), more: trends?.beside?.count ? [`${trends.beside.count} other sensors have the same reference.`] : [] };
+}
+
+// What the agent says there is to do, without the command, which stands below; the mount where it knows nothing better.
+function advice(reason) {
+  const why = explanation(reason), told = why?.best && why.todo.replace(/: fieldcal command accept --sequence \d+$/, " by the command below").replace(/([^.])$/, "$1.");
+  if (told?.startsWith("Correct it")) return `Another ${why.best}? ${told}`;
+  return told || "Look at the mount. If it is loose, fasten it: windows that fit again end HELD.";
 }
 
 // What a person can do: elements with a command to copy.
@@ -69,7 +108,7 @@ export function steps(row, trends) {
   if (row.kind === "silent") return [make("p", "Look at power and network, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "drifting") return [make("p", "Compare it with another reference. If that agrees, accept what it shows."), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`), ...accept];
   if (row.kind === "held" && /^put on hold by/.test(row.reason)) return [make("p", "An operator put it on hold. To use windows again:"), copier(order("hold", { release: true }))];
-  if (row.kind === "held") return [make("p", "Look at the mount. If it is loose, fasten it: windows that fit again end HELD."), ...(accept.length ? accept : [copier("fieldcal show --data-dir /var/lib/fieldcal")])];
+  if (row.kind === "held") return [make("p", advice(row.reason)), ...(accept.length ? accept : [copier("fieldcal show --data-dir /var/lib/fieldcal")])];
   if (row.kind === "no data") return [make("p", "Check power and cables of the sensor, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "uncalibrated") return [make("p", "Turn the sensor to the position that the log names:"), copier("journalctl -fu fieldcal -o cat")];
   return [];
@@ -88,6 +127,6 @@ function small(t, curves, unit, name, marks) {
   const all = curves.flatMap(({ v, u }) => v.flatMap((each, k) => [each - (u?.[k] ?? 0), each + (u?.[k] ?? 0)])).filter(finite);
   const least = unit === " %" ? LEAST_PCT : 0, low = Math.min(-least, ...all), high = Math.max(least, ...all), label = `${name}: ${signed(low, 0.1 * (high - low))} to ${signed(high, 0.1 * (high - low))}${unit}`;
   return make("figure", [spark(`${label}, from ${utcDay(t[0])} to ${utcDay(t.at(-1))}`, curves.map((curve) => ({ t, ...curve })), [t[0], t.at(-1), low, high], marks, 46),
-    make("figcaption", [make("span", [day(t[0])]), make("span", label), make("span", [day(t.at(-1))])])]);
+    make("figcaption", [make("span", label, { class: "of" }), day(t[0]), day(t.at(-1))])]);
 }
 const utcDay = (ns) => day(ns).textContent;
