@@ -20,7 +20,7 @@ $(VENV)/development: requirements-dev.lock $(VENV)/runtime
 	touch $@
 
 run: $(VENV)/runtime  ## the agent on the virtual bench, with a router beside it; PRESET=faulty or guided for others
-	$(BIN)/fieldcal run --preset $(PRESET) --with-router --signing-key keys/virtual.bench.signing.key
+	$(BIN)/fieldcal run --preset $(PRESET) --rate-hz auto --with-router --signing-key keys/virtual.bench.signing.key
 
 # A shell ignores SIGINT in what it runs in the background, so the monitor is ended with SIGTERM.
 fleet: $(VENV)/development  ## router, fleet page and a simulated fleet of 40 sensors, of a year in six minutes; until Ctrl-C

@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -30,6 +31,12 @@ GUIDED: dict[str, dict[str, float]] = {
     "uncertainty": {"alpha_common_deg": 0.0, "transverse_motion_pct": 0.02, "gravity_mps2": 5e-4},
 }
 LOOPBACK = "tcp/127.0.0.1:7447"
+# The FIFO of the virtual sensor holds 32 ms at 1000 Hz, and a reader comes each 16 ms: this is half of what is left.
+TOO_LATE_S, LOOKS, LOOK_S = 0.008, 60, 0.005
+TOO_SLOW = (
+    "this computer is too slow for the simulation at 1000 Hz: a thread was woken {:.0f} ms late. The virtual devices "
+    "have 250 Hz; end other programs to see 1000 Hz"
+)
 
 
 @click.command()
@@ -41,6 +48,8 @@ LOOPBACK = "tcp/127.0.0.1:7447"
               help="The kind of virtual bench, without CONFIG.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=1, show_default=True,
               help="Seed of the virtual bench's random numbers.")  # fmt: skip
+@click.option("--rate-hz", type=click.Choice(["auto", "1000", "250"]), default="1000", show_default=True,
+              help="Rate of the virtual devices; auto: 250 Hz on a computer that is too busy for 1000 Hz.")  # fmt: skip
 @click.option("--signing-key", type=click.Path(path_type=Path), metavar="FILE.key",
               help="Private key that signs the recordings of the virtual bench, made where it is missing; with CONFIG, "
               "recording.signing_key states the key.")  # fmt: skip
@@ -53,6 +62,7 @@ def run(
     duration: float | None,
     preset: str,
     seed: int,
+    rate_hz: str,
     signing_key: Path | None,
     log: str | None,
     with_router: bool,
@@ -70,15 +80,18 @@ def run(
         with ExitStack() as stack:
             if as_json := log == "json" or (log is None and under_journal(os.environ, sys.stderr.fileno())):
                 stack.callback(log_as_json().finish)
+            late_s = lateness_s() if config is None and rate_hz == "auto" else 0.0
             if config is None:
-                settings, truth = stack.enter_context(virtual_bench(preset, seed, signing_key))
+                slow = rate_hz == "250" or late_s > TOO_LATE_S
+                settings, truth = stack.enter_context(virtual_bench(preset, seed, signing_key, slow=slow))
             else:
                 settings, truth = load_config(config), None
             stopping = stack.enter_context(stopped_by_signals())  # up to here a signal ends the process at once
+            too_slow = [TOO_SLOW.format(1e3 * late_s)] if late_s > TOO_LATE_S else []
             said = [stack.enter_context(router(LOOPBACK, stopping))] if with_router else []
             title = f"virtual bench, {preset}" if truth else str(config)
             watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
-            for line in (*said, *signing_key_warnings(settings, data_dir), *_shortcomings(settings)):
+            for line in (*too_slow, *said, *signing_key_warnings(settings, data_dir), *_shortcomings(settings)):
                 watch.say(line)
             stopping.service = Service(settings, data_dir, watch)
             return serve(stopping.service, duration)
@@ -125,17 +138,31 @@ def _shortcomings(settings: Config) -> Iterator[str]:
         yield f"{shown(place)}: {what}; `fieldcal check` names the line"
 
 
+def lateness_s() -> float:
+    """By how much a thread that sleeps is woken too late on this computer now, at most, in s. It takes 0.3 s."""
+    late_s = 0.0
+    for _ in range(LOOKS):
+        begun = time.monotonic()
+        time.sleep(LOOK_S)
+        late_s = max(late_s, time.monotonic() - begun - LOOK_S)
+    return late_s
+
+
 @contextmanager
-def virtual_bench(preset: str, seed: int, signing_key: Path | None = None) -> Iterator[tuple[Config, Any]]:
+def virtual_bench(
+    preset: str, seed: int, signing_key: Path | None = None, *, slow: bool = False
+) -> Iterator[tuple[Config, Any]]:
     """Run the paper's bench as virtual devices under the real drivers; yields (configuration, true values).
 
-    `signing_key`: signs the recordings; a missing one is made. Raises KeyFileError.
+    `signing_key`: signs the recordings; a missing one is made. `slow`: the devices have 250 Hz. Raises KeyFileError.
     """
     from agent.keys.files import gateway_key
     from hw.virtual import presets
     from hw.virtual.live import LiveBench
 
     parameters = getattr(presets, preset)(seed)
+    if slow:
+        parameters = presets.at_rate(parameters, presets.SLOW_HZ)
     known = GUIDED if preset == "guided" else {}
     with LiveBench(parameters, seed) as live:
         poses = [

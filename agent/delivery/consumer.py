@@ -29,6 +29,7 @@ from agent.delivery.progress import Progress
 from agent.delivery.questions import Answer, Dialogue, Questions, Replies, answer_of, steps
 from agent.delivery.received import Received, number_of, receive
 from agent.delivery.session import session_config
+from agent.delivery.turns import Turns
 from agent.delivery.verifying import Refusals, UnverifiedError, Verifier
 
 INBOX = 1000  # samples that may wait; further ones are dropped and later fetched from the gateway's store
@@ -99,6 +100,7 @@ class Consumer:
         self._inbox: queue.Queue[zenoh.Sample | Replies | _Wake] = queue.Queue()
         self._room = threading.Semaphore(INBOX)  # for samples; replies need none, since only so many are asked at once
         self._dialogues: dict[str, Dialogue] = {}  # by source: the gateways that are being asked
+        self._turns = Turns()
         self._held = Held()
         self._asking = Asking(key, self._progress, self._held)
         self._config = session_config("client", connect=endpoints, tls=tls)
@@ -161,6 +163,7 @@ class Consumer:
         try:
             for result in chain(self._results(), (None,)):
                 if result is not None:
+                    self._turns.taken(result)
                     batch.append(result)
                 if batch and (result is None or len(batch) >= most):
                     yield batch
@@ -247,6 +250,12 @@ class Consumer:
         return self._instances.doubled
 
     @property
+    def in_turns(self) -> dict[str, tuple[str, str]]:
+        """The ids of two runs of each gateway that publish in its name in turns (agent.delivery.turns), since the
+        start of this consumer."""
+        return dict(self._turns.found)
+
+    @property
     def malformed(self) -> dict[str, int]:
         """The number of messages at the key of a result that are none, by the gateway in whose name they came."""
         return dict(self._malformed.counts)
@@ -258,6 +267,7 @@ class Consumer:
 
     def _follow(self, result: Received) -> Iterator[Received]:
         if self._progress.has(result):
+            self._turns.came_again(result)
             return
         if self._progress.is_next(result):
             yield from self._asking.deliver(result)

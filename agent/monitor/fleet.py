@@ -43,6 +43,10 @@ VERDICT = ("parameter", "verdict", "change", "u_change", "rate", "u_rate", "onse
            "false_alarms_a_year")  # fmt: skip
 # As calib.estimate.state.DATED puts the date of the certificate behind the identity of a reference.
 _CALIBRATED = re.compile(r"(.*), calibrated ([0-9]{4}-[0-9]{2}-[0-9]{2})", re.DOTALL)
+IN_TURNS = (
+    "two runs have given results the same numbers: gateways with copies of one memory card are on the bus in turns, "
+    "and some of their results are missing here; give one of them another name, data directory and key"
+)
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
 Kind = Literal["drifting", "held", "no data", "silent", "uncalibrated", "sound"]
@@ -80,6 +84,7 @@ class Fleet:
         self._alive: set[tuple[str, str]] = set()
         self._told: dict[tuple[str, str], GatewayTold] = {}
         self._doubled: dict[tuple[str, str], int] = {}
+        self._in_turns: set[tuple[str, str]] = set()
         self._gateways: set[tuple[str, str]] = set()
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
         self._made: dict[Place, dict[str, Any]] = {}  # the row of each sensor
@@ -198,12 +203,13 @@ class Fleet:
             self.version += 1
             self._touch_gateway((site, gateway))
 
-    def set_doubled(self, doubled: Mapping[str, int]) -> None:
-        """The gateways (`<site>/<gateway>`) of which more than one is on the bus, with their numbers."""
-        found = {_place(source): count for source, count in doubled.items()}
+    def set_doubled(self, doubled: Mapping[str, int], in_turns: Collection[str] = ()) -> None:
+        """The gateways (`<site>/<gateway>`) of which more than one is on the bus, with their numbers, and those in
+        whose name two gateways publish in turns."""
+        found, turns = {_place(source): count for source, count in doubled.items()}, set(map(_place, in_turns))
         with self._mutex:
-            self.version += found != self._doubled
-            self._doubled = found
+            self.version += (found, turns) != (self._doubled, self._in_turns)
+            self._doubled, self._in_turns = found, turns
 
     def set_told(self, site: str, gateway: str, status: bytes) -> None:
         """What a gateway says of itself, as JSON; what is no such status is ignored."""
@@ -236,7 +242,8 @@ class Fleet:
             counts = Counter(place[:2] for place in self._newest)
             rows = [
                 _gateway_row(place, counts[place], place in self._alive, self._told.get(place),
-                             refused.get("/".join(place), 0), self._doubled.get(place, 1))
+                             refused.get("/".join(place), 0), self._doubled.get(place, 1),
+                             in_turns=place in self._in_turns)
                 for place in self._gateways | {_place(source) for source in refused}
             ]  # fmt: skip
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
@@ -382,11 +389,20 @@ def _u_pct(calibration: Mapping[str, Any]) -> float | None:
 
 
 def _gateway_row(
-    place: tuple[str, str], sensors: int, alive: bool, told: GatewayTold | None, refused: int, instances: int
+    place: tuple[str, str],
+    sensors: int,
+    alive: bool,
+    told: GatewayTold | None,
+    refused: int,
+    instances: int,
+    *,
+    in_turns: bool,
 ) -> dict[str, Any]:
     why = [] if alive else ["the gateway is not on the bus"]
     if instances > 1:
         why.append(f"{instances} gateways are on the bus under this name: stop one of them, or give it another name")
+    elif in_turns:
+        why.append(IN_TURNS)
     if told is not None and told.state not in CALM:
         why.append(clipped(f"{told.state}: {'; '.join(told.reasons[:10])}"))
     if refused:

@@ -13,12 +13,15 @@ from agent.core.events import DeviceChange, Event, Gap, Result, Tick
 from agent.delivery.publication import PublicationState
 from agent.recording.writer import Recorder
 from agent.terminal.next_step import Guide
+from agent.terminal.quantity import counted
 from agent.terminal.state import DeviceState, RecordingState, Truth, ViewState
 from agent.terminal.view import open_view
 from agent.terminal.wording import gap_line
 from hw.block import BlockFlags, SampleBlock
 
 _log = logging.getLogger(__name__)
+SLOW_TOLD_S = 10.0  # s between two lines that this computer is too slow
+SLOW_REMEDY = "end other programs; --rate-hz 250 asks less of it than 1000"
 RATE_OVER_BLOCKS = 20  # the shown rate is a mean over this many blocks, ten seconds
 
 
@@ -43,6 +46,7 @@ class Watch(logging.Handler):
         self._guide = Guide(config, turns_itself=truth is not None)
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._began_s = time.monotonic()
+        self._simulated, self._told_slow_s = truth is not None, -SLOW_TOLD_S
 
     def __enter__(self) -> Watch:
         self._view = open_view(self.state, sys.stdout, lines=self._lines)
@@ -71,11 +75,20 @@ class Watch(logging.Handler):
             self._take_change(event)
         elif isinstance(event, Gap):
             self.state.devices[event.device].gaps += 1
-            self._said.put(gap_line(event))
+            self._tell_gap(event)
         self.state.take(results)
         self._advise(event, results)
         self._take_said()
         self._view.refresh(now=bool(results))
+
+    def _tell_gap(self, gap: Gap) -> None:
+        """A virtual device loses samples because the computer is busy: that is told once in a while, with the cause."""
+        if not self._simulated:
+            self._said.put(gap_line(gap))
+        elif (now_s := time.monotonic()) - self._told_slow_s > SLOW_TOLD_S:
+            self._told_slow_s = now_s
+            gaps = counted(sum(device.gaps for device in self.state.devices.values()), "gaps")
+            self._said.put(f"this computer is too slow for the simulation: {gaps} in the samples so far; {SLOW_REMEDY}")
 
     def health(self, recorder: Recorder, publication: PublicationState | None) -> None:
         """Take the state of recording and publication, once a second."""

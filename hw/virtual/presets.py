@@ -29,7 +29,7 @@ LARGEST_COUNT = 2**19 - 1
 THETA_DEG = 35.0
 ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
 HOLD_S = 10.0
-BY_HAND_HZ = 250.0
+SLOW_HZ = 250.0  # of devices of which a busy computer loses no samples
 # Four positions at one inclination, then four at another.
 GUIDED_DEG = (
     *((35.0, alpha) for alpha in (0.0, 90.0, 180.0, 270.0)),
@@ -133,11 +133,16 @@ def by_hand(kind: Literal["clamp", "triad", "gravity"], seed: int) -> BenchParam
     reference = bench.reference
     if kind == "triad":
         reference = replace(reference, rotation=np.eye(3))
-    # Serial devices of 250 Hz, of which a busy computer loses no samples.
-    clocks = [replace(device.clock, nominal_rate_hz=BY_HAND_HZ) for device in (bench.sensor, reference)]
-    sensor = replace(bench.sensor, clock=clocks[0], offset_by_window_mps2=0.05 if on_clamp else 0.0025)
-    reference = replace(reference, clock=clocks[1])
-    return replace(bench, schedule=schedule, sensor=sensor, reference=reference)
+    sensor = replace(bench.sensor, offset_by_window_mps2=0.05 if on_clamp else 0.0025)
+    return at_rate(replace(bench, schedule=schedule, sensor=sensor, reference=reference), SLOW_HZ)
+
+
+def at_rate(bench: BenchParameters, rate_hz: float) -> BenchParameters:
+    """The bench with a sensor and a reference of another rate."""
+    clocks = [replace(device.clock, nominal_rate_hz=rate_hz) for device in (bench.sensor, bench.reference)]
+    return replace(
+        bench, sensor=replace(bench.sensor, clock=clocks[0]), reference=replace(bench.reference, clock=clocks[1])
+    )
 
 
 def guided(seed: int) -> BenchParameters:

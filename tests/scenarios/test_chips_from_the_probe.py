@@ -17,7 +17,7 @@ from hw.virtual.bench import Bench
 from hw.virtual.fifo_twin import FifoTwin
 from hw.virtual.kernel import BCM2835, I2CBus
 from hw.virtual.motion import Motion
-from hw.virtual.presets import BY_HAND_HZ, COUNTS_PER_MPS2, HOLD_S, PRESETS, THETA_DEG
+from hw.virtual.presets import COUNTS_PER_MPS2, HOLD_S, PRESETS, SLOW_HZ, THETA_DEG
 from hw.virtual.response import Response
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, clamped
 from hw.virtual.serial_bench import serial_lines
@@ -69,7 +69,7 @@ def plugged(chip: Chip) -> Iterator[tuple[Bench, UmockdevSite, PtyDevice]]:
         noise_mps2=chip.noise_g * STANDARD_GRAVITY_MPS2,
         response=chip.response,
     )
-    reference = replace(preset.reference, clock=replace(preset.reference.clock, nominal_rate_hz=BY_HAND_HZ))
+    reference = replace(preset.reference, clock=replace(preset.reference.clock, nominal_rate_hz=SLOW_HZ))
     schedule = replace(preset.schedule, stands=tuple(clamped(THETA_DEG, alpha, HOLD_S) for alpha in ALPHAS_DEG))
     bench = Bench(replace(preset, motion=MOTION, schedule=schedule, sensor=sensor, reference=reference), 1)
 
@@ -104,7 +104,7 @@ def test_a_chip_becomes_valid(name: str, tmp_path: Path, monkeypatch: pytest.Mon
             monkeypatch.setenv(variable, value)
         named = [] if chip.address else ["--sensor", name, "--sensor-option", "bus=spi0.0"]
         options = [f"--sensor-option={option}" for option in (f"rate_hz={chip.rate_hz}", "range_g=4")]
-        lines = (f"rate_hz={BY_HAND_HZ}", "axes=1", "sequence=true")
+        lines = (f"rate_hz={SLOW_HZ}", "axes=1", "sequence=true")
         options += [f"--reference-option={option}" for option in lines]
         done = fieldcal("init", config, *named, *options, "--reference-port", port.path, "--theta-deg", str(THETA_DEG))
         assert (done.returncode, done.stderr) == (0, "")

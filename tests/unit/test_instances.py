@@ -59,6 +59,36 @@ class Gateway:
         self.store.close()
 
 
+def test_copies_that_are_on_the_bus_in_turns_are_told_and_a_restart_is_not(site: Site, tmp_path: Path) -> None:
+    with closing(Store(tmp_path / "card")) as store:
+        store.commit([record(store.last_sequence() + 1)])
+    shutil.copytree(tmp_path / "card", tmp_path / "copy")
+    with Served(site, tmp_path / "monitor") as served:
+
+        def publish(card: str, run: str) -> int:
+            gateway = Gateway(site, tmp_path / card)
+            made = record(gateway.store.last_sequence() + 1, "status", run_id=run)
+            gateway.store.commit([made])
+            gateway.publisher.publish(made)
+            wait_for(lambda: gateway.store.published() == made.sequence)
+            gateway.close()
+            return made.sequence
+
+        def taken(sequence: int) -> bool:
+            return sequence in served.database.last_sequence().values()
+
+        def why() -> str:
+            (row,) = served.fleet.gateways({})
+            return str(row["why"])
+
+        for run in ("one", "one again"):
+            last = publish("card", run)
+            wait_for(lambda last=last: taken(last))  # type: ignore[misc]
+        assert "copies of one memory card" not in why()
+        assert publish("copy", "another") < last  # its store has never heard of these numbers
+        wait_for(lambda: "copies of one memory card" in why())
+
+
 def test_a_copied_card_is_told_to_the_second_gateway_to_consumers_and_on_the_page(
     site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tomllib
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -16,6 +17,7 @@ from typing import Any
 import pytest
 
 from agent.config import Mqtt
+from agent.core.events import RESULTS, CalibrationUpdate, DriftReport, StatusChange
 from agent.delivery.mqtt import MqttPublisher
 from agent.delivery.store import Store
 from tests.unit.broker import Broker, free_port, needs_mosquitto
@@ -23,7 +25,9 @@ from tests.unit.results import calibration
 from tests.unit.zenoh_site import record, wait_for
 
 pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed (extra mqtt)")
-EXAMPLE = Path(__file__).parents[2] / "examples" / "mqtt_to_influxdb.py"
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "mqtt_to_influxdb.py"
+MQTT = ROOT / "deploy" / "mqtt"
 INFLUXD = """reporting-disabled = true
 bind-address = "127.0.0.1:{other}"
 [meta]
@@ -53,6 +57,32 @@ def test_hostile_names_and_values_stay_within_their_line(example: Any) -> None:
     for value in (b"", b"online", b"[]", b'{"t_utc_ns": 1e99}', b'{"t_utc_ns": null}', b"[" * 100_000, b"\xff"):
         assert example.line_of(topic, value) is None
     assert example.line_of("fieldcal/v1/a", b'{"t_utc_ns": 1}') is None
+
+
+def queries(measurement: str) -> list[str]:
+    """Those of the dashboard of Grafana."""
+    told = [target["query"] for panel in json.loads((MQTT / "grafana.json").read_text())["panels"]
+            for target in panel["targets"]]  # fmt: skip
+    return [query for query in told if f'FROM "{measurement}"' in query]
+
+
+def test_telegraf_and_grafana_know_the_topics_and_the_fields() -> None:
+    from paho.mqtt.client import topic_matches_sub
+
+    (given,) = tomllib.loads((MQTT / "telegraf.conf").read_text())["inputs"]["mqtt_consumer"]
+    top = "fieldcal/v1/site/gw/mems"
+    for topic in (f"{top}/calibration", f"{top}/status", f"{top}/window", f"{top}/drift/Sxx"):
+        assert sum(topic_matches_sub(sub, topic) for sub in given["topics"]) == 1
+        (parsed,) = (each for each in given["topic_parsing"] if topic_matches_sub(each["topic"], topic))
+        named = dict(zip(parsed["tags"].split("/"), topic.split("/"), strict=True))
+        assert named.items() >= {"site": "site", "gateway": "gw", "sensor": "mems"}.items()
+        place = parsed["measurement"].split("/").index("measurement")
+        assert topic.split("/")[place] in ("calibration", "status", "window", "drift")
+    told = {name for kind in (DriftReport, StatusChange, CalibrationUpdate) for name in kind.__struct_fields__}
+    assert told.issuperset(given["json_string_fields"])
+    for kind, field in (("status", "status"), ("drift", "change")):
+        assert [f'SELECT "{field}"' in query for query in queries(kind)] == [True]
+        assert field in RESULTS[kind].__struct_fields__
 
 
 def ask(address: str, **query: str) -> Any:
@@ -95,6 +125,12 @@ def test_a_calibration_arrives_in_influxdb(tmp_path: Path) -> None:
 
         wait_for(came)
         assert rows == [[made.t_utc_ns, made.sensitivity[0][0], made.standard_uncertainty[11], "count", "mems", "gw"]]
+        assert len(queries("calibration")) == 9
+        for query in queries("calibration"):
+            shown = (
+                query.replace("$timeFilter", "time > 0").replace("^$gateway$", "^gw$").replace("^$sensor$", "^mems$")
+            )
+            assert "series" in ask(address, q=shown, db="fieldcal")["results"][0], query
         publisher.close()
     finally:
         for process in (writer, database):

@@ -183,19 +183,21 @@ def test_password_rights_and_limits_of_the_broker(tmp_path: Path, make: Make) ->
 def test_doctor_tries_the_broker_beside_a_running_agent(tmp_path: Path, broker: Broker, make: Make) -> None:
     def found(broker: Broker, **more: Any) -> tuple[str, str]:
         mqtt = {"enabled": True, "port": broker.port, **more}
-        config = parse_config({"gateway": {"site": "site", "name": "gw"}, "mqtt": mqtt}, "")
+        device = {"name": "a", "driver": "serial-csv", "options": {"port": "none", "rate_hz": 100}}
+        devices = {"devices": [device], "channels": [{"sensor": "a", "prior": {"sensitivity": 1.0}}]}
+        config = parse_config({"gateway": {"site": "site", "name": "gw"}, "mqtt": mqtt, **devices}, "")
         (finding,) = broker_findings(config, tmp_path)
         return finding.verdict, finding.says
 
     (tmp_path / "password").write_text("wrong\n")
     (tmp_path / "password").chmod(0o600)
     assert found(broker) == (
-        "advice", f"localhost:{broker.port}: the broker cannot be reached: Connection refused; correct mqtt.host and "
+        "advice", f"127.0.0.1:{broker.port}: the broker cannot be reached: Connection refused; correct mqtt.host and "
         "mqtt.port")  # fmt: skip
     watching = Subscriber(broker.start())
     agent = make()
     wait_for(lambda: settled(agent))
-    assert found(broker) == ("good", f"localhost:{broker.port} takes the connection")
+    assert found(broker) == ("good", f"127.0.0.1:{broker.port} takes the connection")
     agent.publish(record(1, "window"))
     wait_for(lambda: bool(watching.of(f"{TOP}/mems/window")))
     assert watching.of(f"{TOP}/alive") == [b"online"]  # the agent has kept its connection, and no will came

@@ -8,8 +8,10 @@ from dataclasses import asdict
 import pytest
 
 from agent.cli.main import run_cli
-from agent.cli.run import virtual_bench
+from agent.cli.run import lateness_s, virtual_bench
+from agent.core.events import Gap
 from agent.core.identity import identity_of
+from agent.terminal.watch import Watch
 from hw.sensor import load_driver
 
 
@@ -28,6 +30,22 @@ def test_a_calibration_is_kept_for_the_same_bench_and_no_other() -> None:
     first = identity("plain", 1)
     assert identity("plain", 1) == first
     assert len({first, identity("plain", 2), identity("faulty", 1)}) == 3
+
+
+def test_a_slow_computer_gets_devices_of_250_hz_and_gaps_are_told_with_their_cause(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with virtual_bench("plain", 1, slow=True) as (config, truth):
+        assert [device.options["rate_hz"] for device in config.devices] == [250.0, 250.0]
+        gap = Gap(device="mems", t_monotonic_ns=0, dropped=36, unit="bytes", reason="FIFO overrun while it was read")
+        for known in (truth, None):
+            with Watch(config, "bench", known) as watch:
+                for _ in range(3):
+                    watch.update(gap, [])
+    told = [line for line in capsys.readouterr().out.splitlines() if "slow" in line or "dropped" in line]
+    assert told[0].startswith("this computer is too slow for the simulation: 1 gap in the samples so far; ")
+    assert told[1:] == 3 * ["mems: 36 bytes dropped: FIFO overrun while it was read"]  # of real devices
+    assert 0.0 <= lateness_s() < 10.0
 
 
 @pytest.mark.parametrize("duration", ["nan", "inf", "0", "-1", "soon"])

@@ -90,10 +90,13 @@ function showCards(sensors, gateways, filter) {
 const waiting = new Map();
 let asking = false;
 
+// What a history is asked for at once: another kind, or another verdict.
+const stateOfRow = (row) => [row.kind, ...row.verdicts.map((v) => `${v.parameter} ${v.verdict}`)].join();
+
 function ask(rows) {
   for (const row of rows) {
     const name = full(row), before = trends.get(name);
-    if (!before || (before.changed !== row.changed && performance.now() - before.at > AGAIN_MS) || before.kind !== row.kind) waiting.set(name, row);
+    if (!before || (before.changed !== row.changed && performance.now() - before.at > AGAIN_MS) || before.state !== stateOfRow(row)) waiting.set(name, row);
   }
   if (!asking && waiting.size) { asking = true; setTimeout(answer, 30); }
 }
@@ -103,7 +106,7 @@ async function answer() {
   for (const [name] of rows) waiting.delete(name);
   try {
     const found = await get(`api/trends?${new URLSearchParams(rows.map(([name]) => ["of", name]))}`);
-    for (const [name, row] of rows) trends.set(name, { at: performance.now(), changed: row.changed, kind: row.kind, told: found[name] ?? {} });
+    for (const [name, row] of rows) trends.set(name, { at: performance.now(), changed: row.changed, state: stateOfRow(row), told: found[name] ?? {} });
     for (const [name, row] of rows) groups.get(gatewayOf(row))?.built?.get(name)?.history(found[name] ?? {});
     if (latest && rows.some(([name]) => cards.has(name))) showCards(latest.sensors, latest.gateways, filterOf());
   } catch {
