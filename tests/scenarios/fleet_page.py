@@ -50,7 +50,7 @@ VIEWS: dict[str, tuple[dict[str, int], str]] = {
     "fleet-phone": (PHONE, "light"), "fleet-readme": ({"width": 1100, "height": 620}, "light"),
 }  # fmt: skip
 WITH_SENSOR = ("fleet", "fleet-dark")  # of which a picture of a sensor is made too
-COLOURS = 96  # of a picture; more make the file larger and look the same
+COLOURS = 200  # of a picture; more make the file larger and look the same
 SETTLES_MS = 500  # of drawing
 RATE_HZ = 200.0  # of a corrected stream
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
@@ -203,12 +203,12 @@ def axe_faults(page: Any) -> list[str]:
 def write_pictures() -> None:
     """The page with a fleet of 300 days: the fleet at three widths and dark, a sensor on a desk, light and dark.
 
-    Without the gateway that sends hostile texts.
+    Without the gateways that send hostile texts, or have copied cards.
     """
     site = Site()
     with (
         tempfile.TemporaryDirectory() as directory,
-        page_site(site, Path(directory), 12, ("hostile",)) as shown,
+        page_site(site, Path(directory), 12, ("hostile", "cloned")) as shown,
         chromium() as browser,
     ):
         shown.rounds(30)
@@ -231,7 +231,7 @@ def _photograph(page: Any, path: Path) -> None:
     page.wait_for_timeout(SETTLES_MS)
     page.screenshot(path=path)
     with Image.open(path) as picture:
-        small = picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+        small = picture.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     small.save(path, optimize=True)
 
 

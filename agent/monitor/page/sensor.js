@@ -33,7 +33,7 @@ function marksOf(row, trends, whole, statuses) {
   const marks = [];
   for (const v of row?.verdicts ?? []) {
     const change = trends.found?.[v.parameter]?.change, t = (change?.onset_utc_ns ?? v.onset_utc_ns) / 1e9;
-    marks.push({ t, alarm: true, text: `${clean(v.parameter)} ${v.verdict === "stepped" ? "steps" : "begins to drift"}` });
+    marks.push({ t, alarm: true, text: `${clean(v.parameter)} ${(change?.shape ?? v.verdict) === "stepped" ? "steps" : "begins to drift"}` });
   }
   whole.forEach((c, k) => {
     const before = whole[k - 1];
@@ -124,7 +124,7 @@ function showHypotheses(row, statuses) {
   if (!why) return;
   const best = why.best ? [[why.best, why.least, why.none - why.least]] : [];
   const alike = why.alike.map((each) => [each, "as well", ""]);
-  const fit = why.best && !why.fits ? "The best is not within what chance allows. " : !why.best ? "No known explanation fits. " : "";
+  const fit = why.best && !why.fits ? "The best is not within what chance allows. " : !why.best ? "No known explanation fits better. " : "";
   $("hypotheses").replaceChildren(table("Explanations", ["Another…", "χ²", "smaller by"], [["none: no change", why.none, ""], ...best, ...alike]),
     make("p", [`Of ${why.held} held windows, told `, moment(told.t_utc_ns), `; χ² (chi-squared) is ${why.limit} at most if an explanation is right. ${fit}Those that differ by less than 10 are not told apart. The agent states no prior odds.`], { class: "hint" }));
 }

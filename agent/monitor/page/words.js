@@ -64,20 +64,20 @@ export function certificate(row, inUse_utc_ns) {
 }
 
 // What the agent (agent.core.explaining) says of windows that stay held, in its parts; null where it says something else.
-const EXPLAINED = /^(?<held>\d+) held windows contradict the state: chi-squared (?<none>\d+), (?<limit>\d+) at most if it is right\. (?:(?<how>Best fits|Nearest, though not within what chance allows, is) another (?<best>.+?): chi-squared (?<least>\d+), \S+ times smaller\.(?: As well fits: (?<alike>.+?)\.(?= [A-Z]))? )?(?<todo>[^]+)$/;
+const EXPLAINED = /^(?<held>\d+) held windows (?<how>contradict the state: |agree with what the state may have become since its last window \()chi-squared (?<none>\d+), (?<limit>\d+) at most(?: if it is right|\))\. (?:(?<fits>Best fits|Nearest, though not within what chance allows, is) another (?<best>.+?): chi-squared (?<least>\d+)(?:, \S+ times smaller)?\.(?: As well fits: (?<alike>.+?)\.(?= [A-Z]))? |No known explanation fits them(?: better)?\. )(?<todo>[^]+)$/;
 export function explanation(reason) {
   const found = EXPLAINED.exec(reason)?.groups;
   if (!found) return null;
   const alike = found.alike?.split("; ").map((each) => each.replace(/^another /, "")) ?? [];
-  return { held: Number(found.held), none: Number(found.none), limit: Number(found.limit), fits: found.how === "Best fits", best: found.best ?? "", least: Number(found.least), alike, todo: found.todo };
+  return { held: Number(found.held), none: Number(found.none), limit: Number(found.limit), agree: found.how.startsWith("agree"), fits: found.fits === "Best fits", best: found.best ?? "", least: Number(found.least), alike, todo: found.todo };
 }
 
-const inWords = ({ best, alike, fits, least, none }) => (!best ? "No known explanation fits them." : `${fits ? "Explained best by" : "Nearest, but not within what chance allows:"} another ${[best, ...alike].join(", or another ")}: chi-squared ${least} in place of ${none}.`);
+const inWords = ({ best, alike, fits, least, none }) => (!best ? "No known explanation fits them better." : `${fits ? "Explained best by" : "Nearest, but not within what chance allows:"} another ${[best, ...alike].join(", or another ")}: chi-squared ${least} in place of ${none}.`);
 
 // {say, more} of a sensor that is held, perhaps with a step.
 function heldWords(row, verdicts, trends) {
   const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason), kept = trends?.accepted_utc_ns ? [" The calibration before stays in force."] : [];
-  const reason = why ? [`${why.held} windows contradict the calibration.`] : [row.reason, "."];
+  const reason = why ? [`${why.held} windows ${why.agree ? "agree with what the calibration may have become." : "contradict the calibration."}`] : [row.reason, "."];
   return { say: [...since, ...(verdicts.length ? verdicts.flatMap((v) => [...v, " "]) : reason)], more: [...(why ? [inWords(why)] : verdicts.length ? reason : []), ...kept] };
 }
 
@@ -93,9 +93,10 @@ export function told(row, trends) {
   return { say: ["No drift and no step is found", row.last_good_utc_ns ? [". The last good window is of ", moment(row.last_good_utc_ns)] : "", "."].flat(), more: trends?.beside?.count ? [`${trends.beside.count} other sensors have the same reference.`] : [] };
 }
 
+const BELOW = " by the command below";
 // What the agent says there is to do, without the command, which stands below; the mount where it knows nothing better.
 function advice(reason) {
-  const why = explanation(reason), told = why?.best && why.todo.replace(/: fieldcal command accept --sequence \d+$/, " by the command below").replace(/([^.])$/, "$1.");
+  const why = explanation(reason), told = why?.best && why.todo.replace(/: fieldcal command accept --sequence \d+$/, BELOW).replace(/([^.])$/, "$1.");
   if (told?.startsWith("Correct it")) return `Another ${why.best}? ${told}`;
   return told || "Look at the mount. If it is loose, fasten it: windows that fit again end HELD.";
 }
@@ -104,11 +105,12 @@ function advice(reason) {
 export function steps(row, trends) {
   const gateway = `${row.site}/${row.gateway}`, order = (verb, given) => commandLine({ gateway, sensor: row.sensor, verb, arguments: given }, "--connect ENDPOINT");
   const waits = row.estimate && row.estimate_utc_ns >= (trends?.held_utc_ns ?? row.status_utc_ns) && row.status === "HELD";
-  const accept = waits ? [make("p", `If the sensor has really changed, accept estimate ${row.estimate}:`), copier(order("accept", { sequence: row.estimate }))] : [];
+  const told = row.kind === "held" ? advice(row.reason) : "", asked = told.includes(BELOW) ? [] : [make("p", `If the sensor has really changed, accept estimate ${row.estimate}:`)];
+  const accept = waits ? [...asked, copier(order("accept", { sequence: row.estimate }))] : [];
   if (row.kind === "silent") return [make("p", "Look at power and network, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "drifting") return [make("p", "Compare it with another reference. If that agrees, accept what it shows."), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`), ...accept];
   if (row.kind === "held" && /^put on hold by/.test(row.reason)) return [make("p", "An operator put it on hold. To use windows again:"), copier(order("hold", { release: true }))];
-  if (row.kind === "held") return [make("p", advice(row.reason)), ...(accept.length ? accept : [copier("fieldcal show --data-dir /var/lib/fieldcal")])];
+  if (row.kind === "held") return [make("p", told), ...(accept.length ? accept : [copier("fieldcal show --data-dir /var/lib/fieldcal")])];
   if (row.kind === "no data") return [make("p", "Check power and cables of the sensor, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "uncalibrated") return [make("p", "Turn the sensor to the position that the log names:"), copier("journalctl -fu fieldcal -o cat")];
   return [];
