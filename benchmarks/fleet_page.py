@@ -115,15 +115,20 @@ def main() -> None:
                 run(browser, monitor, lambda g=gateway: g.step(time.time_ns(), NEVER))
                 for gateway in to_be_held.gateways
             ]
+            tell(runs, write=args.write)  # before 100 gateways leave the bus, which takes a while
         monitor.stop()
     site.kill()
+
+
+def tell(runs: list[dict[str, float]], *, write: bool) -> None:
+    """Print the table, and write it into the document."""
     lines = [f"{GATEWAYS * SENSORS} sensors of {GATEWAYS} gateways, {len(runs)} runs; {machine()}.", "",
              "| | median | runs |", "| --- | --- | --- |"]  # fmt: skip
     for name in runs[0]:
         values = [each[name] for each in runs]
         lines.append(f"| {name} | {statistics.median(values):.3g} | {', '.join(f'{v:.3g}' for v in values)} |")
-    print("\n".join(lines))
-    if args.write:
+    print("\n".join(lines), flush=True)
+    if write:
         write_part("fleet page", "\n".join(lines), DOCS)
 
 

@@ -15,6 +15,7 @@ from agent.monitor.fleet import MAIN, Fleet, Place
 from agent.monitor.onset import Array, Since, since
 from calib.model import PARAMETERS
 
+PCT_DIGITS = 5  # behind the point of a change in %; more would only make the answers larger
 THINNED = 60  # points of a small plot
 POINTS = 400  # of the history to which a change is fitted
 YEAR_DAYS = 366
@@ -110,7 +111,7 @@ def value_of(calibration: Mapping[str, Any], i: int) -> float | None:
 
 def _pct(first: Mapping[str, Any], last: Mapping[str, Any], i: int) -> float | None:
     a, b = value_of(first, i), value_of(last, i)
-    return 100.0 * (b - a) / abs(a) if a and b is not None else None
+    return round(100.0 * (b - a) / abs(a), PCT_DIGITS) if a and b is not None else None
 
 
 def _certificates(calibration: Mapping[str, Any]) -> list[str]:

@@ -88,7 +88,7 @@ ROUNDS: dict[Behaviour, int] = {
     "drifting": 12,
     "stepped": 10,
     "held": 9,
-    "leaning": 9,
+    "leaning": 12,
     "dying": 8,
     "hostile": 5,
 }
