@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -22,7 +21,7 @@ from agent.fleet.workers import begin
 
 # Gateways in one process, with two threads each that wake up 15 times a second. docs/fleet.md has what more would cost.
 GATEWAYS_EACH = 100
-LEAVE_S = 5.0  # to end in order, once they are to stop; then a process ends as it is: a router sees its gateways leave
+LEAVE_S = 5.0  # to end in order, once they are to stop; then what is left is killed: a router sees its gateways leave
 NICE = 10  # gateways are other machines: simulated ones leave the processor to a router and a monitor on this one
 
 SPAWN = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
@@ -85,7 +84,10 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
         self.unconnected = 0
         self._parts: list[ProcessPoolExecutor] = []
         self._stop = stop or Stopping()
+        self._left = threading.Event()  # all processes have ended
+        threading.Thread(target=self._end_in_time, name="end", daemon=True).start()
         with ExitStack() as opened:
+            opened.callback(self._left.set)
             for part in range(parts):
                 process = opened.enter_context(
                     ProcessPoolExecutor(1, mp_context=SPAWN, initializer=_begin, initargs=(self._stop,))
@@ -127,6 +129,12 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
                 process.submit(_close)
         self._opened.close()
 
+    def _end_in_time(self) -> None:
+        self._stop.wait()
+        if not self._left.wait(LEAVE_S):
+            for process in multiprocessing.active_children():
+                process.kill()
+
     def _each(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
         """What the function gives in each process, where they run at the same time."""
         return [future.result() for future in [part.submit(what, *arguments) for part in self._parts]]
@@ -150,14 +158,7 @@ def _begin(stop: Stopping) -> None:
     _stop = stop
     Ending().status = 0
     begin()
-    threading.Thread(target=_end_after, args=(stop,), name="end", daemon=True).start()
     os.nice(NICE)
-
-
-def _end_after(stop: Stopping) -> None:
-    stop.wait()
-    time.sleep(LEAVE_S)
-    os._exit(0)
 
 
 def _open(
