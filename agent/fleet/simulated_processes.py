@@ -21,7 +21,7 @@ from agent.fleet.workers import begin
 
 # Gateways in one process, with two threads each that wake up 15 times a second. docs/fleet.md has what more would cost.
 GATEWAYS_EACH = 100
-LEAVE_S = 5.0  # to end in order, once they are to stop; then what is left is killed: a router sees its gateways leave
+LEAVE_S = 3.0  # to end in order, once they are to stop; then what is left is killed: a router sees its gateways leave
 NICE = 10  # gateways are other machines: simulated ones leave the processor to a router and a monitor on this one
 
 SPAWN = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
