@@ -1,6 +1,7 @@
 """Writes the id of the engine into a wheel of fieldcal, so that a start on a small computer need not compute it.
 
-hatchling calls it (pyproject.toml). An editable installation has no such file, because its sources change.
+hatchling calls it (pyproject.toml). An editable installation gets no such file, because its sources change; the tests
+write one (tests/conftest.py).
 """
 
 from __future__ import annotations

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 # As every entry point does, and for the same reason: one thread, the same bits on every machine.
@@ -15,9 +17,9 @@ from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
-if TYPE_CHECKING:
-    from pathlib import Path
+from agent.engine import identity
 
+if TYPE_CHECKING:
     from xdist.remote import Producer
 
     from agent.delivery.store import Store
@@ -49,6 +51,17 @@ class ScenariosBesideTheRest(LoadScopeScheduling):
         if wanted is not None:
             self.workqueue.move_to_end(wanted, last=False)
         super()._assign_work_unit(node)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The id of the engine stands in a file, as in a wheel: each program that a test starts would compute it, for a
+    second of processor time. The file does not count any more as soon as a source is another one."""
+    if hasattr(config, "workerinput") or identity.built()[0]:
+        return
+    path = Path(identity.__file__).with_name(identity.BUILT)
+    written = path.with_suffix(f".{os.getpid()}")
+    written.write_text(json.dumps(identity.computed()))
+    written.replace(path)
 
 
 def takes_scenarios(node: WorkerController) -> bool:

@@ -22,7 +22,7 @@ NUMBER = 15
 ROOT = Path(__file__).resolve().parents[2]  # of the packages agent, calib and hw
 # The modules that an engine's process calls, and one that another module imports by a name that it computes.
 BEGIN = ("agent.core.pipeline", "agent.recording.messages", "agent.config.recorded")
-BUILT = "built.json"  # beside this file, in an installation that is not editable
+BUILT = "built.json"  # beside this file, in an installation that is not editable, and where tests have run
 DIGITS = 16  # of the SHA-256 that are the id
 _PACKAGES = ("agent", "calib", "hw")
 
@@ -35,7 +35,7 @@ def name() -> str:
 @cache
 def engine_id() -> str:
     """The first DIGITS hexadecimal digits of the SHA-256 over names and sources of all modules of the engine."""
-    return _built()[0] or computed()["id"]
+    return built()[0] or computed()["id"]
 
 
 def computed() -> dict[str, Any]:
@@ -47,20 +47,19 @@ def computed() -> dict[str, Any]:
 @cache
 def source_files() -> list[tuple[str, Path]]:
     """`closure` of the engine of this program."""
-    return _built()[1] or closure()
+    return built()[1] or closure()
 
 
 @cache
-def _built() -> tuple[str, list[tuple[str, Path]]]:
-    """Id and sources as they were when this installation was built; empty where there is no such file, or a source has
-    changed since."""
+def built() -> tuple[str, list[tuple[str, Path]]]:
+    """Id and sources as the file BUILT has them; empty where there is no such file, or a source has changed since."""
     path = Path(__file__).with_name(BUILT)
     if not path.is_file():
         return "", []
-    built = json.loads(path.read_text())
-    files = [(member, ROOT / member) for member in built["sources"]]
-    same = all(file.is_file() and _sha256(file.read_bytes()) == built["sources"][member] for member, file in files)
-    return (built["id"], files) if same else ("", [])
+    held = json.loads(path.read_text())
+    files = [(member, ROOT / member) for member in held["sources"]]
+    same = all(file.is_file() and _sha256(file.read_bytes()) == held["sources"][member] for member, file in files)
+    return (held["id"], files) if same else ("", [])
 
 
 def digest(sources: dict[str, bytes]) -> str:
