@@ -10,11 +10,9 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import resource
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,6 @@ from agent.core.events import DeviceChange, RunStart
 from agent.core.pipeline import Pipeline
 from agent.engine import identity
 from agent.recording.writer import Recorder
-from benchmarks.agent_cost import peak_mb
 from benchmarks.page import machine, write_part
 from calib.geometry import clamp
 from calib.model import Array
@@ -148,23 +145,29 @@ def write_recording(directory: Path, count: int, axes: int) -> tuple[Path, Path]
 WRITERS = {"parquet": write_parquet, "csv": write_csv, "mcap": write_recording}
 
 
+# A small process that waits for the command: of a child, the kernel counts the memory of the process that started it.
+WAITED = """
+import os, sys
+child = os.posix_spawn(sys.executable, [sys.executable, "-m", "agent", *sys.argv[1:]], os.environ)
+_, status, used = os.wait4(child, 0)
+print(used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, file=sys.stderr)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
 def measured(arguments: Sequence[str]) -> tuple[float, float, str]:
     """CPU time in s, peak memory in MB and standard output of a `fieldcal` command, which must succeed."""
-    before, peak = resource.getrusage(resource.RUSAGE_CHILDREN), 0.0
-    with tempfile.TemporaryFile("w+") as out:
-        with subprocess.Popen([sys.executable, "-m", "agent", *arguments], stdout=out) as process:
-            while process.poll() is None:
-                try:
-                    peak = max(peak, peak_mb(process.pid))
-                except (OSError, StopIteration):
-                    break  # it has just ended
-                time.sleep(0.05)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        took_s = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-        if process.returncode:
-            raise SystemExit(f"{' '.join(arguments)} ended with status {process.returncode}")
-        out.seek(0)
-        return took_s, peak, out.read()
+    done = subprocess.run(
+        [sys.executable, "-c", WAITED, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        stdin=subprocess.DEVNULL,
+    )
+    if done.returncode:
+        raise SystemExit(f"{' '.join(arguments)} ended with status {done.returncode}: {done.stderr}")
+    took_s, peak = done.stderr.split()[-2:]
+    return float(took_s), float(peak), done.stdout
 
 
 def pose_options(directory: Path, count: int, axes: int) -> list[str]:

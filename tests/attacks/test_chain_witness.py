@@ -170,7 +170,7 @@ def test_a_head_reaches_the_witness_over_the_network(tmp_path: Path) -> None:
         publisher.tell_head(head)
         publisher.start()
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
-            wait_for((kept / f"{GATEWAY}.heads").exists, 30.0)
+            wait_for((kept / f"{GATEWAY}.heads").exists)
             process.terminate()
             said = process.communicate(timeout=30)[0]
         with site.client() as client:

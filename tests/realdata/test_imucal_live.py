@@ -71,13 +71,13 @@ def test_played_over_a_port_the_agent_finds_what_imucal_found(tmp_path: Path, ro
     config.write_text(CONFIG.format(port=port, poses=poses, endpoint=router, nominal=NOMINAL))
     playing = ("simulate", "--play", tmp_path / "sensor.csv", "--sequence", "--link", port)
     with started(*playing, output=tmp_path / "playing"):
-        wait_until(port.is_symlink, 20, "the port")
+        wait_until(port.is_symlink, 60, "the port")
         with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as agent:
             # The last rest ends after 27.3 s; what follows is turning.
             wait_until(lambda: len(results(data_dir, "window")) >= len(rests), 60, "six windows")
-            wait_until(lambda: results(data_dir, "calibration")[-1]["windows"] == len(rests), 5, "from all of them")
+            wait_until(lambda: results(data_dir, "calibration")[-1]["windows"] == len(rests), 60, "from all of them")
             in_force = results(data_dir, "calibration")[-1]
-            wait_until(lambda: published(router) == [in_force], 5, "a plain client gets it")
+            wait_until(lambda: published(router) == [in_force], 60, "a plain client gets it")
             interrupt(agent)
     difference = np.abs(np.array(in_force["sensitivity"]) - expected) / np.diag(expected)[:, None]
     assert difference.max() < WITHIN, difference

@@ -49,7 +49,7 @@ def test_a_restored_directory_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     config, data_dir, copy = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "copy"
     config.write_text(config_text(port, private) + COMMANDS)
     with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as process:
-        wait_until(lambda: len(recordings(data_dir)) >= 4 and results(data_dir, "window"), 30, "recordings")
+        wait_until(lambda: len(recordings(data_dir)) >= 4 and results(data_dir, "window"), 60, "recordings")
         old = [release()]
         assert answer(data_dir, old[0])["taken"]
         arguments = ["--data-dir", str(data_dir), "--config", str(config), "--with-keys"]
@@ -74,7 +74,7 @@ def test_a_restored_directory_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     shutil.rmtree(data_dir)
     shutil.copytree(copy / "data", data_dir)
     with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as process:
-        wait_until(lambda: len(results(data_dir, "window")) > len(stored) + 1, 30, "new windows")
+        wait_until(lambda: len(results(data_dir, "window")) > len(stored) + 1, 60, "new windows")
         for command in old:
             assert not (said := answer(data_dir, command))["taken"]
             assert "is not above" in said["reason"]

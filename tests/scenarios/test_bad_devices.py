@@ -84,13 +84,13 @@ def events(data_dir: Path) -> list[Any]:
 def test_unplugged_and_back_it_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     data_dir, output = tmp_path / "data", tmp_path / "output"
     with started("run", configuration(tmp_path, port.path), "--data-dir", data_dir, output=output) as agent:
-        wait_until(lambda: port.has_reader() and recordings(data_dir), 20, "the port is open")
+        wait_until(lambda: port.has_reader() and recordings(data_dir), 60, "the port is open")
         for _ in range(2):
             before = len(statuses(data_dir))
             port.unplug()
-            wait_until(lambda n=before: "INVALID" in statuses(data_dir)[n:], 10, "INVALID after the unplugging")
+            wait_until(lambda n=before: "INVALID" in statuses(data_dir)[n:], 60, "INVALID after the unplugging")
             port.replug()
-            wait_until(lambda: statuses(data_dir)[-1] != "INVALID", 20, "it goes on")
+            wait_until(lambda: statuses(data_dir)[-1] != "INVALID", 60, "it goes on")
         interrupt(agent)
     assert agent.returncode == 0
     assert "Traceback" not in output.read_text()
@@ -101,11 +101,11 @@ def test_unplugged_and_back_it_goes_on(tmp_path: Path, port: PtyDevice) -> None:
 def test_garbage_is_counted_and_the_samples_go_on(tmp_path: Path, port: PtyDevice) -> None:
     data_dir, output = tmp_path / "data", tmp_path / "output"
     with started("run", configuration(tmp_path, port.path), "--data-dir", data_dir, output=output) as agent:
-        wait_until(lambda: any(isinstance(e, SampleBlock) for e in events(data_dir)), 20, "samples come")
+        wait_until(lambda: any(isinstance(e, SampleBlock) for e in events(data_dir)), 60, "samples come")
         for garbage in (b"\x00\xff\xfe\n", b"nan,nan,nan,nan\n", b"7,1e999,0,0\n", b"9" * 5000 + b"\n"):
             said = output.read_text().count("dropped")
             port.inject(garbage)
-            wait_until(lambda n=said: output.read_text().count("dropped") > n, 10, f"{garbage[:20]!r} is said")
+            wait_until(lambda n=said: output.read_text().count("dropped") > n, 60, f"{garbage[:20]!r} is said")
         wait_until(lambda: agent.poll() is None, 1, "it runs")
         interrupt(agent)
     assert agent.returncode == 0
@@ -118,11 +118,11 @@ def test_garbage_is_counted_and_the_samples_go_on(tmp_path: Path, port: PtyDevic
 def test_a_missing_port_is_said_and_waited_for(tmp_path: Path) -> None:
     data_dir, output, link = tmp_path / "data", tmp_path / "output", tmp_path / "late-port"
     with started("run", configuration(tmp_path, link), "--data-dir", data_dir, output=output) as agent:
-        wait_until(lambda: str(link) in output.read_text() and "INVALID" in statuses(data_dir), 20, "it is said")
+        wait_until(lambda: str(link) in output.read_text() and "INVALID" in statuses(data_dir), 60, "it is said")
         device = PtyDevice(Lines(), link=link)
         device.start()
         try:
-            wait_until(lambda: statuses(data_dir)[-1] != "INVALID", 20, "it starts once the port is there")
+            wait_until(lambda: statuses(data_dir)[-1] != "INVALID", 60, "it starts once the port is there")
         finally:
             interrupt(agent)
             device.stop()
@@ -138,7 +138,7 @@ def test_a_silent_device_turns_the_status_invalid_by_tick(tmp_path: Path) -> Non
     try:
         config = configuration(tmp_path, device.path)
         with started("run", config, "--data-dir", data_dir, output=tmp_path / "output") as agent:
-            wait_until(lambda: "INVALID" in statuses(data_dir), 20, "INVALID without a block")
+            wait_until(lambda: "INVALID" in statuses(data_dir), 60, "INVALID without a block")
             interrupt(agent)
     finally:
         device.stop()
@@ -160,7 +160,7 @@ def test_a_wrong_chip_is_named_and_does_not_stop_the_agent(tmp_path: Path, capsy
         runner = threading.Thread(target=service.run, args=(None,))
         runner.start()
         try:
-            wait_until(lambda: "INVALID" in statuses(tmp_path), 20, "the status says it")
+            wait_until(lambda: "INVALID" in statuses(tmp_path), 60, "the status says it")
         finally:
             service.stop()
             runner.join(10)

@@ -30,7 +30,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data directory of a short run, for commands that read one; its public key is in keys/ beside it."""
     directory = tmp_path_factory.mktemp("documented") / "data"
     key = directory.with_name("keys") / "virtual.bench.signing.key"  # as the Makefile has it
-    words = ["run", "--data-dir", directory, "--duration", "4", "--signing-key", key]
+    words: list[str | Path] = ["run", "--data-dir", directory, "--duration", "4", "--signing-key", key]
     with started(*words, output=directory.with_name("output")) as process:
         process.wait(60)
     return directory

@@ -29,7 +29,7 @@ def test_from_plugged_devices_to_a_report(tmp_path: Path) -> None:
     config, data_dir, bench = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "bench"
     served = tmp_path / "served"
     with started("simulate", "--preset", "plain", "--link", bench, output=served):
-        wait_until(lambda: "reference" in served.read_text(), 20, "the ports")
+        wait_until(lambda: "reference" in served.read_text(), 60, "the ports")
         done = fieldcal(
             "init", config, "--sensor-port", f"{bench}-sensor", "--reference-port", f"{bench}-reference",
             "--theta-deg", "35", "--alpha-deg", "0,30,120,210", "--sensitivity", f"{COUNTS_PER_MPS2:.6g}",

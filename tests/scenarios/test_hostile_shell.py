@@ -72,7 +72,7 @@ def test_calibrate_on_control_c_ends_with_130(tmp_path: Path) -> None:
     pipe, output = tmp_path / "result.json", tmp_path / "output"
     os.mkfifo(pipe)  # nobody reads it, so the command cannot end by itself
     with started("calibrate", "--sensor", rests(tmp_path), "--json", pipe, output=output) as process:
-        wait_until(lambda: "guessed" in output.read_text(), 20, "the file is read")
+        wait_until(lambda: "guessed" in output.read_text(), 60, "the file is read")
         interrupt(process)
     assert process.returncode == 130
     assert output.read_text().splitlines()[-1] == "interrupted"

@@ -29,7 +29,7 @@ def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
 
     def up_to(least: int) -> None:
         wait_until(
-            lambda: data.exists() and recordings(data) and number(recordings(data)[-1]) >= least, 40, "it rotates"
+            lambda: data.exists() and recordings(data) and number(recordings(data)[-1]) >= least, 120, "it rotates"
         )
 
     with started("run", config, "--data-dir", data, output=output) as agent:

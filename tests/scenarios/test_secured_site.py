@@ -28,7 +28,7 @@ from tests.scenarios.processes import fieldcal, recordings, wait_until
 from tests.scenarios.secured_site import GATEWAY, KEY, SecuredSite, commanded_agent, make_keys, router
 from tests.unit.zenoh_site import record
 
-SEEN_S = 5.0  # s to wait for a message; it arrives within milliseconds where the router lets it through
+SEEN_S = 60.0  # s to wait for a message; it arrives within milliseconds where the machine is not under load
 
 
 @pytest.fixture(scope="module")

@@ -74,7 +74,7 @@ def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> N
         runner.start()
         try:
             # Not by the objects themselves: a list of them keeps cursors alive, and then SQLite refuses to commit.
-            wait_until(gc.get_freeze_count, 20, "the collector has few objects")
+            wait_until(gc.get_freeze_count, 60, "the collector has few objects")
             assert len(gc.get_objects()) < FEW
         finally:
             service.stop()

@@ -107,15 +107,15 @@ def test_it_tells_how_it_is_from_beginning_to_end(
     with site.client() as client:
         subscriber = client.declare_subscriber("fieldcal/v1/site/gw/status", zenoh.handlers.RingChannel(100))
         wait_until(lambda: systemd.has("READY=1"), 60, "ready")
-        wait_until(lambda: systemd.has("STATUS=running; imu "), 20, "a status with the rate")
+        wait_until(lambda: systemd.has("STATUS=running; imu "), 60, "a status with the rate")
         assert systemd.fed_within(WATCHDOG_S / 2)
         imu.unplug()
-        wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 10, "degraded")
+        wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 60, "degraded")
         assert not systemd.fed_within(2 * WATCHDOG_S), "nothing flows"
         imu.replug()
         plugged_s = time.monotonic()
-        wait_until(lambda: systemd.has("STATUS=running", plugged_s), 20, "running again")
-        wait_until(lambda: systemd.fed_within(WATCHDOG_S / 2), 10, "fed again")
+        wait_until(lambda: systemd.has("STATUS=running", plugged_s), 60, "running again")
+        wait_until(lambda: systemd.fed_within(WATCHDOG_S / 2), 60, "fed again")
         agent.terminate()
         assert agent.wait(5) == 0
         assert systemd.has("STOPPING=1")
@@ -148,7 +148,7 @@ def test_an_absent_device_does_not_keep_it_from_being_ready(
 ) -> None:
     imu.unplug()
     wait_until(lambda: systemd.has("READY=1"), 60, "ready")
-    wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 10, "it says what is missing")
+    wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 60, "it says what is missing")
     assert not systemd.has("WATCHDOG=1")
     agent.terminate()
     assert agent.wait(5) == 0

@@ -41,7 +41,7 @@ def on_a_terminal(tmp_path: Path, *, controlling: bool) -> Iterator[tuple[subpro
     )
     os.close(terminal)
     try:
-        wait_until(lambda: data_dir.exists() and recordings(data_dir), 20, "it records")
+        wait_until(lambda: data_dir.exists() and recordings(data_dir), 60, "it records")
         yield agent, person
     finally:
         if agent.poll() is None:
@@ -61,7 +61,7 @@ def test_a_terminal_that_is_gone_does_not_stop_it(tmp_path: Path) -> None:
     with on_a_terminal(tmp_path, controlling=False) as (agent, person):
         os.close(person)
         before = len(recordings(data_dir))
-        wait_until(lambda: len(recordings(data_dir)) >= before + 3 or agent.poll() is not None, 20, "it goes on")
+        wait_until(lambda: len(recordings(data_dir)) >= before + 3 or agent.poll() is not None, 60, "it goes on")
         assert agent.poll() is None
         interrupt(agent)
     assert agent.returncode == 0

@@ -157,7 +157,7 @@ def test_a_guide_reaches_a_monitor_that_comes_later_and_one_behind_a_new_router(
             site.kill()
             site.restart()
             publisher.show(structs.replace(GUIDE, t_utc_ns=2, prompt="Enter"))
-            wait_for(lambda: prompt() == "Enter", 30.0)
+            wait_for(lambda: prompt() == "Enter")
             publisher.show(structs.replace(GUIDE, t_utc_ns=3, prompt="last"))
             publisher.close()
             wait_for(lambda: prompt() == "last")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import mmap
+import multiprocessing
 import os
 import resource
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,8 +17,11 @@ import pytest
 
 from agent.acquisition.reader import EventQueue
 from agent.delivery.store import Store
+from agent.supervision.health import Situation
 from agent.supervision.plant import Outbox, Plant
 from tests.unit.zenoh_site import record
+
+TAKEN_BYTES = 64 << 20
 
 
 @pytest.fixture
@@ -36,29 +41,37 @@ def plant(data_dir: Path, store: Store, **parts: Any) -> Plant:
     return Plant(data_dir, **found)
 
 
-def test_memory_threads_files_and_disk_are_the_processs_own(tmp_path: Path, store: Store) -> None:
-    looked_at = plant(tmp_path, store)
+def situations(directory: Path) -> tuple[Situation, Situation]:
+    """Before and after this process has taken 64 MiB, seven files and a thread."""
+    store = Store(directory, 0)
+    looked_at = plant(directory, store)
     before = looked_at.situation()
-    # Mapped by itself: an ordinary array could come from what the allocator kept of earlier tests.
-    held = mmap.mmap(-1, 64 << 20)
-    held.write(b"\1" * len(held))
-    opened = [open(os.devnull) for _ in range(7)]  # noqa: SIM115 - counted, then closed
-    done = threading.Event()
-    thread = threading.Thread(target=done.wait)
-    thread.start()
-    after = looked_at.situation()
-    done.set()
-    thread.join()
-    for file in opened:
-        file.close()
-    size_bytes = len(held)
-    held.close()
+    # Mapped by itself: an ordinary array could come from what the allocator has kept.
+    with mmap.mmap(-1, TAKEN_BYTES) as held:
+        held.write(b"\1" * TAKEN_BYTES)
+        opened = [open(os.devnull) for _ in range(7)]  # noqa: SIM115 - counted, then closed
+        done = threading.Event()
+        thread = threading.Thread(target=done.wait)
+        thread.start()
+        after = looked_at.situation()
+        done.set()
+        thread.join()
+        for file in opened:
+            file.close()
+    store.close()
+    return before, after
+
+
+def test_memory_threads_files_and_disk_are_the_processs_own(tmp_path: Path) -> None:
+    """In a process of its own: in this one, connections and threads of earlier tests end when they like."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
+        before, after = alone.submit(situations, tmp_path).result()
     assert before.process is not None
     assert after.process is not None
     assert after.process.open_files - before.process.open_files == 7
     assert after.process.threads - before.process.threads == 1
     # What the allocator gave back meanwhile is not known to the byte.
-    assert after.process.rss_bytes - before.process.rss_bytes > 0.8 * size_bytes
+    assert after.process.rss_bytes - before.process.rss_bytes > 0.8 * TAKEN_BYTES
     free = os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize
     assert after.disk_free_bytes == pytest.approx(free, rel=0.05)  # others write here too
     assert (after.queues["pipeline"].capacity, after.queues["recording"].waiting) == (120, 3)

@@ -57,13 +57,13 @@ def test_a_killed_monitor_loses_nothing_and_keeps_nothing_twice(site: Site, tmp_
         found = []
         for results in KILLED_AT:
             running = monitor()
-            wait_for(lambda least=results: len(kept(engine)) > least, 30.0)
+            wait_for(lambda least=results: len(kept(engine)) > least)
             running.kill()
             found.append(len(kept(engine)))
         assert found[-1] < RESULTS  # else it was not killed on its way
         running = monitor()
         try:
-            wait_for(lambda: len(kept(engine)) >= RESULTS, 30.0)
+            wait_for(lambda: len(kept(engine)) >= RESULTS)
         finally:
             running.stop()
         assert kept(engine) == [first + k for k in range(RESULTS)]

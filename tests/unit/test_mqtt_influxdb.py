@@ -109,7 +109,7 @@ def test_a_calibration_arrives_in_influxdb(tmp_path: Path) -> None:
             except OSError:
                 return False
 
-        wait_for(ready, 30)
+        wait_for(ready)
         url = f"{address}/write?db=fieldcal&precision=ns"
         writer = subprocess.Popen([sys.executable, EXAMPLE, "127.0.0.1", str(broker.port), url])
         publisher = MqttPublisher("site", "gw", Mqtt(enabled=True, port=broker.port), store.history, poll_s=0.02)

@@ -103,7 +103,7 @@ def attempts(sensor: Any, losses: int) -> list[int]:
 
     reader = Reader("imu", sensor, events)
     reader.start()
-    wait_until(lost, 20, "losses")
+    wait_until(lost, 60, "losses")
     reader.stop()
     reader.join()
     return [e.attempt for e in seen[:losses]]

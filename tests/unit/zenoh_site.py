@@ -62,7 +62,7 @@ def sequence_of(sample: zenoh.Sample) -> int:
     return number
 
 
-def wait_for(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     """Until the condition holds; an AssertionError after `timeout_s`."""
     end = time.monotonic() + timeout_s
     while not condition():
@@ -70,7 +70,7 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
         time.sleep(0.01)  # polls; the condition decides, not the time
 
 
-def taken_until(consumer: Consumer, done: Callable[[Received], bool], timeout_s: float = 20.0) -> list[Received]:
+def taken_until(consumer: Consumer, done: Callable[[Received], bool], timeout_s: float = 60.0) -> list[Received]:
     """The results up to the first for which `done` holds; those that came within `timeout_s` where it never does."""
     timer = threading.Timer(timeout_s, consumer.close)
     timer.start()
