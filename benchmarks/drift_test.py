@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.estimate.false_alarms import false_alarm_rate, false_alarm_threshold
 from calib.estimate.onsets import CLIP, FEWEST, SPAN, Onsets
@@ -49,7 +50,7 @@ class Glr:
         self._onsets, self._k = Onsets(SERIES), 0
         self._threshold = false_alarm_threshold(RATE, FEWEST, SPAN)
 
-    def alarms(self, score: Array) -> Array:
+    def alarms(self, score: Array) -> NDArray[np.bool_]:
         """Alarms (SERIES,) after one more window with scores `score` (SERIES,)."""
         self._onsets.update(self._k * HOUR_S, score, np.ones(SERIES))
         self._k += 1
@@ -65,7 +66,7 @@ class Cusum:
         self._threshold = math.log(one_sided) / size - 1.166
         self._sums = np.zeros((2, SERIES))
 
-    def alarms(self, score: Array) -> Array:
+    def alarms(self, score: Array) -> NDArray[np.bool_]:
         """Alarms (SERIES,) after one more window with scores `score` (SERIES,)."""
         cut = np.clip(score, -CLIP, CLIP)
         self._sums = np.maximum(self._sums + np.array([cut, -cut]) - self._allowance, 0.0)

@@ -84,6 +84,8 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
             "temperature": {"at": 7, "type": "f32"},
         }
     )  # fmt: skip
+    epson = EpsonOptions.model_validate({"port": "p"})
+    velocity = EpsonOptions.model_validate({"port": "p", "unit": "m/s", "rate_hz": 3000.0})
     frames = b"".join(_closed(bytes([0xAA, 0x55, i, *range(8)])) for i in range(8))
     wit = b"".join(
         witmotion_twin.frame(0x50, 0, 0, 0, 5 * i) + witmotion_twin.frame(0x51, 1, 2, 3, 4) for i in range(5)
@@ -97,10 +99,10 @@ def parsers() -> dict[str, tuple[bytes, Parse]]:
         "icm42688": (b"@" + bytes(7) + b"@" * 16, lambda data, i: icm42688_registers.samples(_whole(data, 8))),  # noqa: ARG005
         "lis3dh": (bytes(60), lambda data, i: lis3dh_registers.samples(_whole(data, 6))),  # noqa: ARG005
         "witmotion": (wit, _fed(WitStream(Cutter("w", 200.0), 200.0))),
-        "epson": (_epson(b"A352AD10"), _fed(EpsonStream(Cutter("e", 200.0), EpsonOptions(port="p")))),
+        "epson": (_epson(b"A352AD10"), _fed(EpsonStream(Cutter("e", 200.0), epson))),
         "epson, velocity": (
             _epson(b"A342VD10"),
-            _fed(EpsonStream(Cutter("v", 3000.0), EpsonOptions(port="p", unit="m/s", rate_hz=3000.0))),
+            _fed(EpsonStream(Cutter("v", 3000.0), velocity)),
         ),
         "mip": (_mip(), _fed(MipStream(Cutter("m", 100.0), 100.0))),
         "serial-binary": (frames, _fed(BinaryStream(Cutter("b", 100.0), binary))),

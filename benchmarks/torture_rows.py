@@ -23,7 +23,7 @@ S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01
 Q_TRUE = np.array([0.36, -0.06, 0.165])
 ANGLE_DEG, OFFSET_MPS2, LAG_S, CORNER_HZ = 0.2, 0.05, 0.005, 0.16
 # Priors where a row has no others: the lag is always unknown, because no clock in the field is known to be synchronous.
-FIXED = replace(Priors.none(), lag_s=0.02)
+FIXED = replace(Priors.none(), lag_s=0.02)  # type: ignore[call-arg]
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ class IioRig(Rig):
     def __init__(self, root: Path, together: int = 1) -> None:
         self.saturated = range(0)
         self.twin = IioTwin(root, self.counts, self.stamps_ns, self.due, stamped=self.stamped, together=together)
-        self.sensor = self.build()
+        self.sensor = self.build()  # type: ignore[assignment]
 
     def build(self, **changes: object) -> Iio:
         options = IioOptions.model_validate({"device": "twin345", "rate_hz": self.rate_hz} | changes)
@@ -183,7 +183,7 @@ class TestIio(SensorContract):
         enable = rig.twin.sysfs / "iio:device0/buffer/enable"
         enable.write_text("1")
         with monkeypatch.context() as patch:
-            patch.setattr(iio.os, "open", busy)
+            patch.setattr("hw.iio.os.open", busy)
             with pytest.raises(ConfigurationError, match="iio:device0: Device or resource busy"):
                 rig.sensor.open()
         assert enable.read_text() == "1"
@@ -243,7 +243,7 @@ class TestTogether:
         yield from installed(UnstampedRig(tmp_path, together=16), monkeypatch)
 
     def test_each_lot_is_a_burst_with_its_arrival(self, rig: IioRig) -> None:
-        rig.rate_hz, rig.sensor = 200.0, rig.build(rate_hz=200.0)
+        rig.rate_hz, rig.sensor = 200.0, rig.build(rate_hz=200.0)  # type: ignore[assignment]
         rig.open()
         late_s, clock = [], ClockModel(rig.rate_hz)
         for block in rig.blocks(60.0):

@@ -222,7 +222,7 @@ def test_integers_of_sparkplug() -> None:
 
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "paho.mqtt.client", None)
-    options = MqttOptions(host="h", topic="t", rate_hz=100)
+    options = MqttOptions.model_validate({"host": "h", "topic": "t", "rate_hz": 100})
     with pytest.raises(ConfigurationError, match=r"fieldcal extras --install mqtt"):
         options.check_installed()
 

@@ -140,7 +140,7 @@ class TestSeedlink(SensorContract):
             list(rig.blocks(2.0))
 
     def test_a_silent_server_is_told(self, rig: SeedLinkRig) -> None:
-        rig.server._received = lambda _: b""  # type: ignore[method-assign]
+        rig.server._received = lambda data: b""  # type: ignore[method-assign]  # noqa: ARG005
         with pytest.raises(DeviceLost, match="no answer to 'HELLO'"):
             rig.open()
 

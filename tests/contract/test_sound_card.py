@@ -115,7 +115,7 @@ class TestSoundCard(SensorContract):
 def test_without_the_library_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "sounddevice", None)
     with pytest.raises(ConfigurationError, match=r"fieldcal extras --install sound"):
-        SoundCard("sensor", SoundCardOptions()).open()
+        SoundCard("sensor", SoundCardOptions.model_validate({})).open()
 
 
 def test_plates() -> None:

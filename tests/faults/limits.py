@@ -86,7 +86,7 @@ class Filter:
         """Add `action` for a call with arguments as in `where`; a call that this machine does not have is ignored."""
         number = self._library.seccomp_syscall_resolve_name(call.encode())
         if number >= 0:
-            comparisons = (Comparison * len(where))(*where)
+            comparisons = (Comparison * len(where))(*(Comparison(*one) for one in where))
             check(-self._library.seccomp_rule_add_array(self._context, action, number, len(where), comparisons))
 
     def load(self) -> None:

@@ -109,7 +109,7 @@ def debian(tmp_path: Path) -> Iterator[DebianRoot]:
 
 
 def build(checkout: Path, version: str, output: Path, *more: str) -> None:
-    command = [checkout / "deploy/debian/build.sh", "--output", output, "--version", version, *more]
+    command: list[str | Path] = [checkout / "deploy/debian/build.sh", "--output", output, "--version", version, *more]
     subprocess.run(command, check=True, capture_output=True)
 
 
@@ -190,7 +190,7 @@ def test_both_commands_of_the_readme(debian: DebianRoot) -> None:
     """In a checkout without a virtual environment. pip finds the wheels of both lock files beside it, and no index."""
     checkout = debian.path / "srv/fieldcal"
     subprocess.run(["git", "clone", "--quiet", ROOT, checkout], check=True)
-    download = [
+    download: list[str | Path] = [
         sys.executable,
         "-m",
         "pip",

@@ -32,7 +32,9 @@ def calibrations(draw: st.DrawFn) -> Calibration:
     return calibration(S, draw(st.floats(-10, 10)), u_pct, draw(st.integers(0, 12)))
 
 
-KINDS = ("consistent",) * 4 + ("jumped",) * 5 + ("unsupported", "lost", "back", "accept", "accept", "release")
+KINDS: tuple[str, ...] = (
+    ("consistent",) * 4 + ("jumped",) * 5 + ("unsupported", "lost", "back", "accept", "accept", "release")
+)
 KINDS += ("hold", "rollback")
 steps = st.lists(
     st.tuples(st.sampled_from(KINDS), calibrations(), st.none() | calibrations(), st.integers(1, 6)), max_size=60

@@ -228,7 +228,7 @@ def _transfer(memory: Memory, call: Callable[[object], int], address: int) -> in
         message.buf = ctypes.cast(content, ctypes.POINTER(ctypes.c_char))
     argument.msgs = messages
     result = call(argument)
-    for buffer, count, content in kept:
-        if buffer is not None:
-            memory.write(buffer, content.raw[:count])
+    for place, count, content in kept:
+        if place is not None:
+            memory.write(place, content.raw[:count])
     return result

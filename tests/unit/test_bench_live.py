@@ -122,7 +122,7 @@ def test_decimals_tell_multiples_of_the_resolution_apart(resolution, decimals) -
 
 def test_bench_time_begins_when_told() -> None:
     bench_time = BenchTime()
-    due = bench_time.gated(plain(1).sensor.clock.due)
+    due = bench_time.gated(plain(1).sensor.clock.due)  # type: ignore[arg-type]
     assert due(1e6) == 0
     bench_time.begin(1e6)
     assert bench_time(1e6 + 2.5) == 2.5

@@ -65,7 +65,7 @@ def test_white_noise_has_its_sd_and_is_white() -> None:
         shifted = np.mean(noise[1:] * noise[:-1], axis=0) / sd**2
         assert np.abs(shifted).max() < 4 / np.sqrt(n)
     v = bench.sensor_values(0, n)
-    assert np.abs(np.corrcoef(v.T)[~np.eye(3, dtype=bool)]).max() < 4 / np.sqrt(n)
+    assert np.abs(np.corrcoef(v.T)[~np.eye(3, dtype=bool)]).max() < 4 / np.sqrt(n)  # type: ignore[index]
     # If both devices had the same numbers, these would appear in the order in which they are drawn.
     drawn_first, reference = v.ravel()[:BLOCK], bench.reference_values(0, BLOCK)[:, 0]
     assert abs(np.corrcoef(drawn_first, reference)[0, 1]) < 4 / np.sqrt(BLOCK)
@@ -108,7 +108,7 @@ def test_drawn_faults_have_their_sd_and_leave_the_rest_alone() -> None:
         "reference": (np.array([d.reference.sensitivity - 1 for d in draws]), 0.001),
         "transverse": (np.array([(d.motion.amplitude_mps2[0, 1:] / -10j).real for d in draws]), 0.01),
         "gravity": (np.array([d.gravity_mps2 - 9.80665 for d in draws]), 0.03),
-        "rotation": (np.array([np.rad2deg(d.reference.rotation[[2, 0, 1], [1, 2, 0]]) for d in draws]), 0.5),
+        "rotation": (np.array([np.rad2deg(d.reference.rotation[[2, 0, 1], [1, 2, 0]]) for d in draws]), 0.5),  # type: ignore[index]
     }
     for name, (values, sd) in samples.items():
         # chi-squared by its normal limit at 4 SD: 9 checks, false alarm below 1e-3 in all
@@ -157,7 +157,7 @@ def test_presets_are_what_they_say(seed) -> None:
     assert hard.sensor.lag_s == (0.005, 0.005, 0.005)
     assert hard.sensor.clock.rate_error == 0.013
     assert np.abs(hard.clamp.alpha_by_position_deg).max() > 0.05
-    assert np.abs(hard.sensor.offset_by_position_mps2).max() > 0.02
+    assert np.abs(hard.sensor.offset_by_position_mps2).max() > 0.02  # type: ignore[arg-type]
     assert hard.knocks.rate_hz > 0
     assert hard.temperature.swing_k > 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import cos, pi, radians, sin, sqrt
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ G = 9.80665
 STILL = 1e-12  # rounding of sums of a few numbers of about 10
 
 
-def one_position(theta_deg: float = 35.0, alpha_deg: float = 30.0, **changes: object) -> BenchParameters:
+def one_position(theta_deg: float = 35.0, alpha_deg: float = 30.0, **changes: Any) -> BenchParameters:
     """3 Hz, 10 m/s2, one position from 0 s on."""
     schedule = Schedule((clamped(theta_deg, alpha_deg, hold_s=100.0),), turn_s=1.0, start_s=0.0)
     return replace(BenchParameters(schedule=schedule), **changes)

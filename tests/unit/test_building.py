@@ -213,7 +213,7 @@ def test_what_dies_is_silent_and_what_lives_is_untouched() -> None:
 
 
 def test_turned_swapped_and_far_away() -> None:
-    quiet = {"sensor": Instrument(0.0, EXACT), "reference": Instrument(0.0, EXACT)}
+    quiet: dict[str, Any] = {"sensor": Instrument(0.0, EXACT), "reference": Instrument(0.0, EXACT)}
     order = np.eye(3)[[1, 0, 2]]
     whole, swapped = visited(Transformed("", "sensor", order), **quiet)
     assert np.array_equal(values(swapped, "sensor"), values(whole, "sensor")[:, [1, 0, 2]])

@@ -35,7 +35,9 @@ def of_lorries(random: np.random.Generator, narrow: float = 0.0) -> Record:
     lines = np.fft.rfft(u)
     lines[:, (frequency_hz > 4.0) & (frequency_hz < 5.0)] *= 1.0 + narrow
     V = np.fft.irfft(lines, n) + 5e-4 * strong * random.standard_normal((3, n))
-    bands = beside_noise(band_sums(u.T, du.T, V.T, RATE_HZ), np.full(3, np.inf))
+    plain = band_sums(u.T, du.T, V.T, RATE_HZ)
+    assert plain is not None
+    bands = beside_noise(plain, np.full(3, np.inf))
     sums = window_sums(u.T, du.T, V.T, np.linspace(0, n, WINDOW_S + 1).astype(int))
     return Record.of(Window(0.0, WINDOW_S, POSE, sums, True, "", n, 0, bands=bands), 0.0)
 

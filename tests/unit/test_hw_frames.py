@@ -175,9 +175,9 @@ def test_witmotion_refuses_what_its_port_cannot_carry() -> None:
     with pytest.raises(
         ValidationError, match="100 samples/s of 22 bytes, 10 bits each, are 22000 bit/s; baud_rate is only 9600"
     ):
-        WitMotionOptions(port="p", baud_rate=9600)
+        WitMotionOptions.model_validate({"port": "p", "baud_rate": 9600})
     with pytest.raises(ValidationError, match="60 Hz is not a rate of this device; use one of 200, 100"):
-        WitMotionOptions(port="p", rate_hz=60.0)
+        WitMotionOptions.model_validate({"port": "p", "rate_hz": 60.0})
 
 
 def binary_stream(**changes: object) -> BinaryStream:

@@ -52,7 +52,9 @@ def test_of_one_frequency_each_period_is_a_minimum() -> None:
     np.testing.assert_allclose(np.sort(at_s), [-0.08, 0.02, 0.12], atol=1e-3)
 
 
-def outputs(lag_s: np.ndarray, seed: int = 1, size: np.ndarray | float = 1.0) -> tuple[np.ndarray, ...]:
+def outputs(
+    lag_s: np.ndarray, seed: int = 1, size: np.ndarray | float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(V, expected, time) where each sample has a lag of its own and S is `size` times what is expected."""
     time_s = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
     V = size * (motion(time_s - lag_s, seed, (0.5, 12.0)) @ S.T)

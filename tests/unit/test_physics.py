@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def inputs(**moved: np.ndarray | float) -> np.ndarray:
 
 
 TURN = np.array([0.03, -0.02, 0.05])
-WORLDS = {
+WORLDS: dict[str, tuple[dict[str, Any], Any]] = {
     "as stated": ({}, lambda _, u: (u @ D.T + GRAVITY) @ S_TRUE.T + Q_TRUE),
     "the sensor turned": (
         {"TURN": TURN, "TURN_GRAVITY": TURN},

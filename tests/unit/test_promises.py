@@ -60,8 +60,11 @@ def test_the_first_block_carries_restart_and_the_others_what_they_say(machine: M
 def test_numbers_of_numpy_become_numbers_of_python(machine: Machine, check: BlockCheck) -> None:
     machine.after_s = 1.0
     plain = block(1.0, 5)
-    numpys = {"t_utc_ns": np.int64(plain.t_utc_ns), "first_index": np.int64(5), "nominal_rate_hz": np.float32(100.0)}
-    taken = check.taken(replace(plain, **numpys, temperature_raw=np.uint16(7), temperature_degc=np.float32(21.5)))
+    numpys: dict[str, Any] = {
+        "t_utc_ns": np.int64(plain.t_utc_ns), "first_index": np.int64(5), "nominal_rate_hz": np.float32(100.0),
+        "temperature_raw": np.uint16(7), "temperature_degc": np.float32(21.5),
+    }  # fmt: skip
+    taken = check.taken(replace(plain, **numpys))
     values = (taken.t_utc_ns, taken.first_index, taken.nominal_rate_hz, taken.temperature_raw, taken.temperature_degc)
     assert values == (plain.t_utc_ns, 5, 100.0, 7, 21.5)
     assert [type(value) for value in values] == [int, int, float, int, float]

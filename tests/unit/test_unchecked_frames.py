@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from hw.block import BlockFlags
 from hw.cutting import Cutter
@@ -25,7 +27,7 @@ SUMMED = {"end": "0d", "length": 22, "checksum": "sum16", "checksum_from": 1, "c
 FLETCHER = {"start": "8065", "length": 22, "checksum": "fletcher16"}
 
 
-def axes(n: int) -> list[tuple[int, int, int]]:
+def axes(n: int) -> list[tuple[int, ...]]:
     """Indications of n samples; each sample has others."""
     return [(16_000_000 + 97 * k, -1_000_003 * (k % 16) - k, 0x0102_0304 ^ k) for k in range(n)]
 
@@ -50,7 +52,7 @@ def stream(**changes: object) -> BinaryStream:
     return BinaryStream(Cutter("s", RATE_HZ), SerialBinaryOptions.model_validate(options))
 
 
-def read(data: bytes, *, piece: int = 1000, **changes: object) -> tuple[list[tuple[int, ...]], int, BinaryStream]:
+def read(data: bytes, *, piece: int = 1000, **changes: Any) -> tuple[list[tuple[int, ...]], int, BinaryStream]:
     """The indications that are handed on, and the number of bytes that are not, from the first one on."""
     made = stream(**changes)
     rows: list[tuple[int, ...]] = []
@@ -68,7 +70,7 @@ def test_a_byte_inside_that_looks_like_the_start() -> None:
 
 
 @pytest.mark.parametrize("changes", [CLOSED, COUNTED, CLOSED | COUNTED])
-def test_what_tells_the_start(changes: dict[str, object]) -> None:
+def test_what_tells_the_start(changes: dict[str, Any]) -> None:
     rows, dropped, made = read(b"".join(epson(2000))[1:], **changes)
     assert rows == axes(2000)[2 : 2000 - ("end" not in changes)]  # the first whole frame only proves the second
     assert (dropped, made.undecided) == (0, "")
@@ -88,16 +90,21 @@ def test_the_place_is_told_as_soon_as_the_other_one_does_not_fit() -> None:
     assert (dropped, made.undecided) == (0, "")
 
 
+def counter(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Byte 1 of each frame."""
+    return numbers(frames, 1, "u8", "little").astype(np.uint8)
+
+
 def test_a_counter_rises_evenly() -> None:
     """At the other place stands a byte that is never twice the same, but does not count."""
     frames = [bytes([0x80, 3 * k % 256, 0x80, k * k % 251, 7]) for k in range(90)]
-    search = UncheckedFrames(Layout(b"\x80", 5), lambda frames: numbers(frames, 1, "u8", "little"))
+    search = UncheckedFrames(Layout(b"\x80", 5), counter)
     found = search.find(b"".join(frames)[1:])
     assert list(map(bytes, found.frames)) == frames[2:89]
 
 
 @pytest.mark.parametrize("changes", [COUNTED, CLOSED | COUNTED])
-def test_two_halves_of_different_frames_are_no_sample(changes: dict[str, object]) -> None:
+def test_two_halves_of_different_frames_are_no_sample(changes: dict[str, Any]) -> None:
     """Bytes were lost until the same byte of a later frame: start and end fit. The counter, which is behind the other
     numbers, does not."""
     frames, true = epson(60), axes(60)
@@ -112,7 +119,7 @@ def test_another_place_that_fits_after_a_loss_is_left_again() -> None:
     """Bytes are lost until the place that was taken is one at which the frames fit, too. Their counter does not."""
     frames = [bytes([0x80, 3 * k % 256, 0x80, k * k % 251, 7]) for k in range(90)]
     for piece in (7, 1000):
-        search, rest, found = UncheckedFrames(Layout(b"\x80", 5), lambda f: numbers(f, 1, "u8", "little")), b"", []
+        search, rest, found = UncheckedFrames(Layout(b"\x80", 5), counter), b"", []
         data = b"".join(frames[:40]) + b"".join(frames[45:])[2:]
         for at in range(0, len(data), piece):
             new = search.find(rest + data[at : at + piece])
@@ -136,7 +143,7 @@ def damaged(frames: list[bytes], k: int, kind: str) -> Iterator[bytes]:
 
 @pytest.mark.parametrize("kind", ["cut", "lost", "added"])
 @pytest.mark.parametrize("changes", [CLOSED, COUNTED, CLOSED | COUNTED])
-def test_the_way_is_found_within_two_frames(changes: dict[str, object], kind: str) -> None:
+def test_the_way_is_found_within_two_frames(changes: dict[str, Any], kind: str) -> None:
     frames, true = epson(64), axes(64)
     for data in damaged(frames, 20, kind):
         rows, _, _ = read(data, piece=37, **changes)
@@ -207,7 +214,7 @@ def test_a_stream_cut_anywhere_gives_the_same_frames(parts: list[bytes], cuts: l
     ("changes", "advised"),
     [({}, True), ({"start": "8065"}, False), (CLOSED, False), (COUNTED, False), (SUMMED, False)],
 )
-def test_one_byte_that_tells_nothing_is_advised_against(changes: dict[str, object], advised: bool) -> None:
+def test_one_byte_that_tells_nothing_is_advised_against(changes: dict[str, Any], advised: bool) -> None:
     advice = stream(**changes)._options.advice
     assert bool(advice) == advised
     assert all("start is the single byte 80" in text and "state checksum, end or sequence" in text for text in advice)
