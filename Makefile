@@ -1,4 +1,4 @@
-# Two commands matter: `make run` and `make test`. Both make .venv from the hash-pinned lock file first.
+# Three commands matter: `make run`, `make test-quick`, `make test`. They make .venv from the hash-pinned lock first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ PRESET ?= plain
 # Images for containers set it. Then each program that a test starts would compile its sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run fleet test nightly lint bench faults faults-short soak lock deb container site clean
+.PHONY: run fleet test test-quick test-thorough test-all nightly lint bench faults faults-short soak lock deb container site clean
 
 $(VENV)/runtime: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -35,12 +35,24 @@ once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-faile
 # Two for each processor: one of them takes scenarios, which mostly wait for programs that they start (tests/conftest.py).
 PROCESSES = $$((2 * $$(nproc)))
 
-# The drivers' contract reads 140,000 samples here, which a counter of 16 bits does twice; `pytest tests/contract`
-# reads a million.
-test: export FIELDCAL_CONTRACT_SAMPLES = 90000
-test: $(VENV)/development
-	$(BIN)/python -m pytest -n $(PROCESSES) --dist loadscope --no-loadscope-reorder -m "not faults" || \
-		$(call once_more,-m "not faults")
+# $(1): processes; $(2): which tests
+tested = $(BIN)/python -m pytest -n $(1) --dist loadscope --no-loadscope-reorder $(2)
+
+# The drivers' contract reads 90,000 samples here, more than a counter of 16 bits has; `pytest tests/contract` reads
+# a million.
+test test-thorough: export FIELDCAL_CONTRACT_SAMPLES = 90000
+test: $(VENV)/development  ## before a merge: what decides whether results, uncertainties, recordings and the program are right
+	$(call tested,$(PROCESSES),-m "not faults and not thorough") || $(call once_more,-m "not faults and not thorough")
+
+# The drivers' contract reads 5,000 samples here.
+test-quick: export FIELDCAL_CONTRACT_SAMPLES = 5000
+test-quick: $(VENV)/development  ## before a commit: modules, properties and drivers, in a minute and a half
+	$(call tested,$$(nproc),-m "not faults and not thorough and not slow" tests/unit tests/properties tests/contract)
+
+test-thorough: $(VENV)/development  ## what `make test` leaves out: worlds of months, other adapters, more seeds
+	$(call tested,$(PROCESSES),-m thorough) || $(call once_more,-m thorough)
+
+test-all: test test-thorough  ## all tests that need neither root nor hardware
 
 nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt
 	$(BIN)/python -m tests.nightly

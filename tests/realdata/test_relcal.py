@@ -49,6 +49,7 @@ def calibrated(sensor: np.ndarray, reference: np.ndarray, rate_hz: float) -> Out
     )  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_all_that_was_recorded_is_refused_and_its_response_told() -> None:
     """Up to 100 Hz the ratio grows to 2.6 and falls again: no smooth response explains it, and no S is told. Each band

@@ -62,7 +62,7 @@ def started(*arguments: str | Path, output: Path, directory: Path = ROOT) -> Ite
         process.wait()
 
 
-def interrupt(process: subprocess.Popen[bytes]) -> float:
+def interrupt(process: subprocess.Popen[Any]) -> float:
     """Interrupt a process as Ctrl-C does; returns the time that it took to end, in s."""
     began_s = time.monotonic()
     process.send_signal(signal.SIGINT)
@@ -70,14 +70,17 @@ def interrupt(process: subprocess.Popen[bytes]) -> float:
     return time.monotonic() - began_s
 
 
-def wait_until(condition: Any, timeout_s: float, what: str) -> Any:
-    """Wait until `condition()` is true and return its value. Fails after `timeout_s`; `what` names what was awaited."""
+def wait_until(condition: Any, timeout_s: float, what: str, every_s: float = 0.05) -> Any:
+    """Wait until `condition()` is true and return its value. Fails after `timeout_s`; `what` names what was awaited.
+
+    `every_s`: how often to ask.
+    """
     end_s = time.monotonic() + timeout_s
     while time.monotonic() < end_s:
         value = condition()
         if value:
             return value
-        time.sleep(0.05)  # polls; the condition decides, not the time
+        time.sleep(every_s)  # polls; the condition decides, not the time
     raise AssertionError(f"{what}: not within {timeout_s:g} s")
 
 

@@ -34,7 +34,7 @@ def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything(rate_hz: float)
     assert day.u[[0, 4, 8]].max() < 0.002  # of 5 % that the data sheet left
 
 
-@pytest.mark.parametrize("said", [1e5, 1e20])
+@pytest.mark.parametrize("said", [1e5, pytest.param(1e20, marks=pytest.mark.thorough)])
 def test_a_garbled_line_makes_no_place_deaf(said: float) -> None:
     """A garbled line gives a huge value, which must not raise the threshold so far that later turns are not found."""
     world = bench.world(SEED, 200.0)
@@ -50,7 +50,7 @@ def test_a_garbled_line_makes_no_place_deaf(said: float) -> None:
     )
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.thorough) for k in (1, 2))])
 def test_reads_that_beat_with_the_samples_cost_no_window(seed: int) -> None:
     """Sensor and reference are read every 16 and 10 ms at 200 Hz: the lag differs by about 0.3 ms between windows.
 

@@ -39,6 +39,7 @@ def rows(page: Any, caption: str) -> list[list[str]]:
     return [row.locator("td").all_inner_texts() for row in table.all()]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, browser: Any) -> None:
     monitor = Monitor(site.endpoint, tmp_path / "monitor")

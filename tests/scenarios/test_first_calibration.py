@@ -65,6 +65,7 @@ def test_from_plugged_devices_to_a_report(tmp_path: Path) -> None:
     assert reported["sensor"] == "sensor"
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.skipif(ABSENCE is not None, reason=str(ABSENCE))
 def test_a_chip_that_the_probe_finds_to_a_certificate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

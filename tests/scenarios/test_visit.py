@@ -15,6 +15,7 @@ from tests.scenarios.processes import fieldcal
 SEED = 2
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_two_visits_with_a_turned_and_a_loose_clamp(tmp_path):
     """Each wrong clamp is named; then S of both sensors is right within its U, and one reference's error is shared."""

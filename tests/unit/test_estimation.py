@@ -157,18 +157,20 @@ def test_a_wild_window_among_the_held_ones_does_not_stand_in_the_way() -> None:
     assert actions(hours(found, [wild, *jump], first=10)) == ["hold"] * 5 + ["adopt"]
 
 
-@pytest.mark.slow
-def test_a_reference_wrong_by_more_than_max_change_is_held_and_proposed_and_ends_when_it_ends() -> None:
+@pytest.mark.parametrize(
+    "held", [pytest.param(8, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.thorough)]
+)
+def test_a_reference_wrong_by_more_than_max_change_is_held_and_proposed_and_ends_when_it_ends(held: int) -> None:
     random = np.random.default_rng(6)
     found = settled(random)
     before = found.in_force
-    wrong = hours(found, [building_window(random, S=S_TRUE * 1.6) for _ in range(30)], first=10)
-    assert actions(wrong) == ["hold"] * 30
+    wrong = hours(found, [building_window(random, S=S_TRUE * 1.6) for _ in range(held)], first=10)
+    assert actions(wrong) == ["hold"] * held
     assert wrong[-1].decision.status == "HELD"
     assert wrong[-1].decision.reason.startswith("S or Q changed by more than max_change: ")
     assert wrong[-1].decision.proposal is not None
     assert found.in_force is before
-    right = hours(found, [building_window(random) for _ in range(3)], first=40)
+    right = hours(found, [building_window(random) for _ in range(3)], first=10 + held)
     assert actions(right) == ["take"] * 3
     assert right[-1].decision.status == "VALID"
 

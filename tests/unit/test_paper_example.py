@@ -14,6 +14,7 @@ import pytest
 REPOSITORY = Path(__file__).parents[2]
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_example_writes_its_page_and_every_figure_on_it(tmp_path: Path) -> None:
     command = [sys.executable, "examples/paper.py", str(tmp_path), "--benches", "4"]
