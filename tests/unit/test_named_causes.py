@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -97,10 +98,21 @@ def beside(sensor: object, reference: object, **options: object) -> Outcome:
     return calibrate(sensor, reference, **{"rotation": np.eye(3), **options})
 
 
+@cache
+def sound() -> Outcome:
+    """What is found beside the triad where nothing is wrong."""
+    return beside(*triad())
+
+
+@cache
+def of_twenty_seconds() -> Outcome:
+    """The same of half as long."""
+    return beside(*triad(seconds=20.0))
+
+
 def test_a_sound_triad_has_no_warning() -> None:
-    found = beside(*triad())
-    right(found)
-    assert found.warnings == ()
+    right(sound())
+    assert sound().warnings == ()
 
 
 def test_sensor_and_reference_exchanged_are_refused_by_the_size_of_gravity() -> None:
@@ -202,7 +214,7 @@ def test_one_short_window_is_refused_and_a_longer_one_is_not() -> None:
     reason = only_reason(beside(*(tuple(each) for each in short)))
     assert "only one window of" in reason
     assert "two windows, or 10 s" in reason
-    right(beside(sensor, reference))
+    right(of_twenty_seconds())
 
 
 ALPHAS_DEG = (0.0, 30.0, 120.0, 210.0)
@@ -240,8 +252,8 @@ def test_what_the_next_tests_are_told_to_do_is_accepted() -> None:
 @pytest.mark.parametrize(
     ("divided_by", "multiply", "told"),
     [
-        (G_MPS2, "9.807", "it is in g"),
-        (0.001, "0.001", "it is in mm/s2"),
+        pytest.param(G_MPS2, "9.807", "it is in g", marks=pytest.mark.slow),
+        pytest.param(0.001, "0.001", "it is in mm/s2", marks=pytest.mark.thorough),
     ],
 )
 def test_a_uniaxial_reference_in_another_unit_is_found_by_gravity(divided_by: float, multiply: str, told: str) -> None:
@@ -255,7 +267,9 @@ def in_rad(poses: list[dict[str, float]], *names: str) -> list[dict[str, float]]
     return [row | {name: np.deg2rad(row[name]) for name in names} for row in poses]
 
 
-@pytest.mark.parametrize("names", [("alpha_deg",), ("theta_deg", "alpha_deg")])
+@pytest.mark.parametrize(
+    "names", [("alpha_deg",), pytest.param(("theta_deg", "alpha_deg"), marks=pytest.mark.thorough)]
+)
 def test_angles_in_rad_are_named(names: tuple[str, ...]) -> None:
     sensor, reference, poses = clamped()
     found = calibrate(sensor, reference, in_rad(poses, *names))
@@ -278,7 +292,7 @@ def test_times_in_ms_are_named_for_the_table_that_has_them() -> None:
     assert found.reasons[0].startswith(
         "by its times the sensor's sampling rate is 0.1 Hz: if they are in ms, divide all"
     )
-    right(beside(sensor, reference))
+    right(of_twenty_seconds())
 
 
 @pytest.mark.parametrize(("channel", "times"), [(0, 0.0), (1, 1.0 / 30.0), (2, 0.0)])
@@ -294,7 +308,6 @@ def test_a_dead_channel_of_the_reference_is_named_and_no_output_called_dead(chan
         or f"channel along {axis} is dead" in found.reasons[0]
     )
     assert not any(reason.startswith("output ") for reason in found.reasons)
-    right(beside(sensor, (t, a)))
 
 
 def test_a_dead_channel_is_found_behind_a_rotation() -> None:

@@ -23,8 +23,8 @@ RATE_HZ = 200.0
 AXES = [{"at": at, "type": "i32"} for at in (5, 9, 13)]
 COUNTED = {"sequence": {"at": 17, "type": "u16"}}
 CLOSED = {"end": "0d"}
-SUMMED = {"end": "0d", "length": 22, "checksum": "sum16", "checksum_from": 1, "checksum_order": "big"}
-FLETCHER = {"start": "8065", "length": 22, "checksum": "fletcher16"}
+SUMMED: dict[str, Any] = {"end": "0d", "length": 22, "checksum": "sum16", "checksum_from": 1, "checksum_order": "big"}
+FLETCHER: dict[str, Any] = {"start": "8065", "length": 22, "checksum": "fletcher16"}
 
 
 def axes(n: int) -> list[tuple[int, ...]]:
