@@ -56,14 +56,17 @@ def _within(n: int, low: int, high: int, share: float) -> float:
 
 
 @pytest.mark.slow
-def test_the_first_window_alone_is_as_uncertain_as_it_says() -> None:
+@pytest.mark.parametrize(
+    ("lives", "least", "most"), [(40, 0.80, 1.12), pytest.param(160, 0.85, 1.04, marks=pytest.mark.thorough)]
+)
+def test_the_first_window_alone_is_as_uncertain_as_it_says(lives: int, least: float, most: float) -> None:
     """The colour of the noise is estimated from the segments of this one window.
 
-    The rms of 480 errors divided by u must be 1; by chance it differs by 3 %. One weak window alone may not tell a
-    response that settles; it is refused then.
+    The rms of three errors a life divided by u must be 1; by chance that of 160 lives differs by 3 %, that of 40 by
+    6 %. One weak window alone may not tell a response that settles; it is refused then.
     """
     errors, refused = [], 0
-    for seed in range(160):
+    for seed in range(lives):
         drawn = node(seed, all_axes=True, timing=Timing(20.0, 60.0, 1))
         run = Run(drawn.config)
         results = [r for event in visits(drawn.building, range(1)) for r in run.feed(event)]
@@ -76,5 +79,5 @@ def test_the_first_window_alone_is_as_uncertain_as_it_says() -> None:
         known = np.array(update.determined)[[0, 4, 8]]
         errors.append(np.diag((np.array(update.sensitivity) - truth) / u)[known])
     rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-    assert 0.85 < rms < 1.04
+    assert least < rms < most
     assert refused <= 2

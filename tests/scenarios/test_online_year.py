@@ -28,7 +28,7 @@ def followed(elsewhere: float) -> Year:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("elsewhere", [0.0, 0.3])
+@pytest.mark.parametrize("elsewhere", [0.0, pytest.param(0.3, marks=pytest.mark.thorough)])
 def test_a_step_of_one_per_cent_is_found_and_followed(elsewhere: float) -> None:
     building, seen = world(elsewhere), followed(elsewhere)
     found = seen.step_found_after(building)
@@ -43,7 +43,7 @@ def test_a_step_of_one_per_cent_is_found_and_followed(elsewhere: float) -> None:
     assert seen.alarms_before() == []
 
 
-@pytest.mark.parametrize("elsewhere", [0.0, 0.3])
+@pytest.mark.parametrize("elsewhere", [0.0, pytest.param(0.3, marks=pytest.mark.thorough)])
 def test_the_mean_output_is_right_and_q_within_its_uncertainty(elsewhere: float) -> None:
     seen = followed(elsewhere)
     assert np.abs(seen.mean_error_mps2).max() < 2e-3
@@ -56,10 +56,14 @@ def test_the_mean_output_is_right_and_q_within_its_uncertainty(elsewhere: float)
 def test_what_was_not_excited_stays_as_it_was() -> None:
     columns = np.array(followed(0.0).columns)
     assert np.abs(columns - columns[0]).max() < 1e-12
-    assert np.abs(np.array(followed(0.3).columns) - columns[0]).max() > 1e-3  # with other motion they change
+
+
+@pytest.mark.thorough
+def test_with_other_motion_the_other_columns_change() -> None:
+    assert np.abs(np.array(followed(0.3).columns) - followed(0.0).columns[0]).max() > 1e-3
+    assert min(followed(0.3).u_syy) > 0.7e-3
 
 
 def test_no_number_of_windows_makes_it_better_known_than_the_reference() -> None:
-    for elsewhere in (0.0, 0.3):
-        assert min(followed(elsewhere).u_syy) > 0.7e-3
+    assert min(followed(0.0).u_syy) > 0.7e-3
     assert followed(0.0).u_syy[-1] > 1e-3  # motion along the reference's y only: u of that channel is 0.1 %
