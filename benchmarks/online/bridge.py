@@ -2,7 +2,9 @@
 
 The physics are those of a bridge, not of the model: a few modes that wind excites all the time, lorries whose axles
 strike an expansion joint and bend the span, a level that follows wind and traffic, a body that warms later than the
-thermometer in the chip. S, Q and the mount change as a sensor ages; devices are lost, swapped, struck and turned.
+thermometer in the chip. S, Q and the mount change as a sensor ages; devices are lost, swapped, struck and turned. There
+are three still nights, a power cut of three hours after which the program starts again, and an earthquake that goes
+over the sensor's range. The sensor is an ADXL355, or a chip of 12 bits whose noise is as large as the wind's motion.
 """
 
 from __future__ import annotations
@@ -58,9 +60,13 @@ NAMES = {  # what is said of an event by name; the shock changes the output alon
 }
 SETTLED = 12  # windows after an event was told
 LOST = (5.2, 5.6)  # days between which the reference is lost
+CUT = (10.3, 10.42)  # days between which there is no power
+STILL_NIGHTS, STILL_HOURS, STILL = (3, 11, 20), range(1, 5), 0.02  # of the wind's level; no lorry
+QUAKE, QUAKE_MPS2, QUAKE_HZ = 27 * 24 + 15, 12.0, (0.7, 6.0)  # visit, largest rms, band; it lasts for some 20 s
 SHOCK, TURN_DEG, SHIFT_S = 0.005, 0.3, 0.012
-REFERENCES = ("DC", "AC")
-Job = tuple[str, int]
+REFERENCES, SENSORS = ("DC", "AC"), ("ADXL355", "12 bits")
+DIGIT_MPS2, NOISE_OF_12_BITS_MPS2 = 0.00980665, 0.02  # 1 mg a digit; 200 ug a root hertz at 100 Hz
+Job = tuple[str, str, int]  # reference, sensor, seed
 CORNER_HZ = 0.05
 
 
@@ -97,11 +103,14 @@ class Bridge(Building):
         """Level of the wind's motion in a visit: it changes within some hours, around a level of the day."""
         smooth = np.exp(-np.abs(np.arange(-24, 25)) / 8.0)
         drawn = np.random.default_rng(self.seed).standard_normal(24 * DAYS + 100)[visit : visit + len(smooth)]
-        return float(WIND_MPS2 * np.exp(0.8 * drawn @ smooth / np.linalg.norm(smooth)))
+        level = float(WIND_MPS2 * np.exp(0.8 * drawn @ smooth / np.linalg.norm(smooth)))
+        return STILL * level if _is_still(visit) else level
 
     def lorries(self, visit: int) -> int:
         """How many cross the bridge in a visit."""
         hour = visit % 24
+        if _is_still(visit):
+            return 0
         night, day = LORRIES_A_MINUTE
         rate = night + (day - night) * max(np.sin(np.pi * (hour - 5) / 16), 0.0)
         return int(np.random.default_rng([self.seed, visit]).poisson(rate * WINDOW_S / 60.0))
@@ -119,6 +128,8 @@ class Bridge(Building):
         for (natural_hz, damping, shape), force in zip(MODES, forces, strict=True):
             s = 1j * frequency_hz / natural_hz
             lines += (s**2 / (s**2 + 2.0 * damping * s + 1.0) * np.fft.rfft(force))[:, None] * np.array(shape)
+        if visit == QUAKE:
+            lines += np.fft.rfft(_quake(random, time_s), axis=0)
         if response is not None:
             lines *= response(frequency_hz)[:, None]
         return Moved(CubicSpline(time_s, np.fft.irfft(lines, points, axis=0)))  # type: ignore[return-value]
@@ -146,6 +157,20 @@ class Bridge(Building):
         return self.wind_mps2(visit)
 
 
+def _is_still(visit: int) -> bool:
+    return visit // 24 in STILL_NIGHTS and visit % 24 in STILL_HOURS
+
+
+def _quake(random: np.random.Generator, time_s: Array) -> Array:
+    """(n, 3) acceleration of the ground, which the bridge follows."""
+    hz = np.fft.rfftfreq(len(time_s), 1.0 / GRID_HZ)
+    lines = np.fft.rfft(random.standard_normal((len(time_s), 3)), axis=0)
+    shaken = np.fft.irfft(np.where((hz >= QUAKE_HZ[0]) & (hz <= QUAKE_HZ[1]), 1.0, 0.0)[:, None] * lines, axis=0)
+    middle_s = random.uniform(time_s[0] + 20.0, time_s[-1] - 20.0)
+    grows = np.exp(-0.5 * ((time_s - middle_s) / 6.0) ** 2)
+    return np.asarray(QUAKE_MPS2 / shaken.std() * grows[:, None] * shaken)
+
+
 def _axle(forces: Array, time_s: Array, at_s: float, across_s: float, weight: Array) -> None:
     """Add the forces of an axle that strikes the joint at a time, and bends the span until it has crossed it."""
     on = slice(*np.searchsorted(time_s, [at_s - 0.03, at_s + across_s]).tolist())
@@ -162,6 +187,7 @@ class Happens(Harm):
 
     turn: Array = field(default_factory=lambda: np.eye(3))
     range_mps2: float = 19.6
+    digit_mps2: float = 0.0  # 0: finer than the noise
 
     def shown(self, visit: Visit, values: Array) -> Array:
         days = float(visit.time_s[0]) / DAY_S
@@ -169,11 +195,13 @@ class Happens(Harm):
             return values
         if days >= EVENTS["turn"] + 0.5:
             values = values @ self.turn.T
+        if self.digit_mps2:
+            values = self.digit_mps2 * np.round(values / self.digit_mps2)
         return np.clip(values, -self.range_mps2, self.range_mps2)
 
     def arrived(self, visit: Visit, blocks: list[Any]) -> list[Any]:
         days = float(visit.time_s[0]) / DAY_S
-        if visit.role == "reference" and LOST[0] <= days < LOST[1]:
+        if CUT[0] <= days < CUT[1] or (visit.role == "reference" and LOST[0] <= days < LOST[1]):
             return []
         if visit.role == "sensor" and days >= EVENTS["shift"] + 0.5:
             late = round(SHIFT_S * 1e9)
@@ -207,7 +235,7 @@ class World:
         return np.append((turn @ S).ravel(), turn @ Q)
 
 
-def world(seed: int, reference: str) -> World:
+def world(seed: int, reference: str, sensor: str = SENSORS[0]) -> World:
     """Draw everything from the seed. The configuration states what an operator knows, and no walks."""
     random = np.random.default_rng([seed, 5])
     axis = random.standard_normal(3)
@@ -227,19 +255,26 @@ def world(seed: int, reference: str) -> World:
         tilt_rad_a_day=np.deg2rad(0.1) / 30.0 * np.append(random.standard_normal(2), 0.0),
         weather=Weather(20.0, 0.0, random.uniform(2.5, 5.0)),
         reference_sensitivity=_reads(random),
-        sensor=adxl355(Instrument(0.003, Clock(250.0, 3e-5 * random.standard_normal(), 0.0013, 2e-5), late=usb), 250.0),
+        sensor=_sensor(sensor, 3e-5 * random.standard_normal(), usb),
         reference=Instrument(
             0.0005, Clock(200.0, 3e-5 * random.standard_normal(), 0.0004), late=usb,
             response=ac if reference == "AC" else None,
         ),
     )  # fmt: skip
-    harm, s_per_k = Happens("what happens", turn=turn), 1e-4 * random.uniform(0.3, 1.0)
+    digit = DIGIT_MPS2 if sensor == SENSORS[1] else 0.0
+    harm, s_per_k = Happens("what happens", turn=turn, digit_mps2=digit), 1e-4 * random.uniform(0.3, 1.0)
     made = Bridge(parameters, seed, harm, s_per_k)
     later = Bridge(replace(parameters, reference_sensitivity=_reads(random)), seed, harm, s_per_k)
     corner = {"corner_hz": CORNER_HZ, "u_corner_hz": 0.05 * CORNER_HZ} if reference == "AC" else {}
     prior = {"sensitivity": 1.0, "u_main_pct": 1.5, "u_transverse_pct": 0.75, "u_offset_mps2": 0.3}
     config = building_config(made, prior=prior, certificate={"u_sensitivity_pct": 0.1} | corner)
     return World(made, later, config, turn)
+
+
+def _sensor(name: str, rate_error: float, late: Bursts) -> Instrument:
+    if name == SENSORS[1]:
+        return Instrument(NOISE_OF_12_BITS_MPS2, Clock(200.0, rate_error, 0.0013, 2e-5), late=late)
+    return adxl355(Instrument(0.003, Clock(250.0, rate_error, 0.0013, 2e-5), late=late), 250.0)
 
 
 def _reads(random: np.random.Generator) -> Array:
@@ -285,8 +320,8 @@ class Month:
 
 def one(job: Job) -> Month:
     """Simulate a month."""
-    reference, seed = job
-    own = world(seed, reference)
+    reference, sensor, seed = job
+    own = world(seed, reference, sensor)
     house, hours = House(own.bridge, own.config), list[Hour]()
     gateway = house.gateway
     for visit in range(DAYS * HOURS_A_DAY):
@@ -294,6 +329,8 @@ def one(job: Job) -> Month:
         if visit == at_visit("swap"):
             house.fit(own.later, "B")
             house.plug()
+        if visit == round(CUT[1] * HOURS_A_DAY):
+            house.restart(own.config)
         house.visit()
         update = gateway.in_force
         assert update is not None  # the first window is taken
@@ -333,14 +370,15 @@ def at_visit(event: str) -> int:
 
 
 def jobs(runs: int) -> list[Job]:
-    """All runs: each kind of reference with the same seeds."""
-    return [(reference, SEED + run) for reference in REFERENCES for run in range(runs)]
+    """All runs: each kind of reference and of sensor with the same seeds."""
+    return [(reference, sensor, SEED + run) for sensor in SENSORS for reference in REFERENCES for run in range(runs)]
 
 
 def table(found: Sequence[Month]) -> str:
     """One row for each run, and what was said of its events."""
     lines = [
-        "| reference, seed | VALID, % of windows | HELD, % | VALID beyond 3 u, 4 u | of these before an event was told "
+        "| reference, sensor, seed | VALID, % of windows | HELD, % | VALID beyond 3 u, 4 u "
+        "| of these before an event was told "
         "| u of main S, %: day 8, end | " + " | ".join(f"{event}: told after, error" for event in EVENTS) + " |",
         "| --- |" + " --- |" * (5 + len(EVENTS)),
     ]
@@ -351,12 +389,13 @@ def table(found: Sequence[Month]) -> str:
         ]
         three, four = run.beyond
         lines.append(
-            f"| {run.job[0]}, {run.job[1] - SEED} | {100.0 * run.valid:.1f} | {100.0 * run.held:.1f} | {three}, {four} "
+            f"| {_name(run.job)} | {100.0 * run.valid:.1f} | {100.0 * run.held:.1f} | {three}, {four} "
             f"| {run.unseen} | {run.u_pct[0]:.3f}, {run.u_pct[1]:.3f} | {' | '.join(told)} |"
         )
-    said = [
-        f"- {run.job[0]}, {run.job[1] - SEED}, {event}: {text}"
-        for run in found
-        for event, (_, _, text) in run.told.items()
-    ]
+    said = [f"- {_name(run.job)}, {event}: {text}" for run in found for event, (_, _, text) in run.told.items()]
     return "\n".join([*lines, "", *said])
+
+
+def _name(job: Job) -> str:
+    reference, sensor, seed = job
+    return f"{reference}, {sensor}, {seed - SEED}"
