@@ -72,7 +72,7 @@ class Trends:
             "budget": {source: [u[i] for i in MAIN] for source, u in ends[1].get("budget", {}).items()},
             "held_utc_ns": _lasting(statuses),
             "certificate_utc_ns": _certificate_since(history),
-            "found": {v["parameter"]: _trend(v, from_then) for v in verdicts},
+            "found": {v["parameter"]: _trend(v, from_then, ends) for v in verdicts},
             "beside": self._fleet.beside(place),
         }
 
@@ -149,8 +149,16 @@ def change_in(days: Array, values: Array, verdict: Mapping[str, Any]) -> tuple[S
     return (other, instead) if own is None or instead.squares < 0.5 * own.squares else (told, own)
 
 
-def _trend(verdict: Mapping[str, Any], history: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The parameter of a verdict over time, and the `change` that its history shows; None where it shows none."""
+def _trend(
+    verdict: Mapping[str, Any],
+    history: Sequence[Mapping[str, Any]],
+    ends: tuple[Mapping[str, Any], Mapping[str, Any]],
+) -> dict[str, Any]:
+    """The parameter of a verdict over time, and the `change` that its history shows; None where it shows none.
+
+    The values of a history lie on a smooth line even where all of them are wrong: a drift that the agent does not know
+    yet makes them late. So u of size and rate contain that of the change from the first to the last one, the `ends`.
+    """
     i = PARAMETERS.index(verdict["parameter"])
     known = [(c["t_utc_ns"], v, c["standard_uncertainty"][i]) for c in history if (v := value_of(c, i)) is not None]
     t_utc_ns = [t for t, _, _ in known]
@@ -158,6 +166,8 @@ def _trend(verdict: Mapping[str, Any], history: Sequence[Mapping[str, Any]]) -> 
     rising = np.append(True, np.diff(days) > 0) if len(days) else np.zeros(0, dtype=bool)
     shape, change = change_in(days[rising], values[rising], verdict)
     thin = _thinned(len(known))
+    u_between = 0.5 * (change_of(*ends, i)["U"] or 0.0)
+    u_a_day = u_between / max(float(days[-1]) - change.day, 1.0) if change and change.rate else 0.0
     return {
         "t_utc_ns": [known[k][0] for k in thin],
         "values": [known[k][1] for k in thin],
@@ -166,6 +176,7 @@ def _trend(verdict: Mapping[str, Any], history: Sequence[Mapping[str, Any]]) -> 
         "change": change
         and {
             "shape": shape, "onset_utc_ns": round(change.day * DAY_NS), "u_onset_days": change.u_day,
-            "size": change.size, "u_size": change.u_size, "rate": change.rate, "u_rate": change.u_rate,
+            "size": change.size, "u_size": math.hypot(change.u_size, u_between), "rate": change.rate,
+            "u_rate": math.hypot(change.u_rate, u_a_day),
         },
     }  # fmt: skip

@@ -219,4 +219,7 @@ def test_what_a_history_tells_of_a_drift(tmp_path: Path, told: str) -> None:
     assert abs(change["onset_utc_ns"] / DAY_NS - begin / DAY_NS - 200) < 2 * change["u_onset_days"] < 5
     assert abs(change["rate"] - 2.615) < 2 * change["u_rate"]
     assert abs(change["size"] - 2.615 * 165) < 3 * change["u_size"]
+    # The smooth line alone has u of 0.5; that of the change from the first to the last value is the larger part.
+    assert change["u_size"] == pytest.approx(0.5 * found["changes"][0]["U"], rel=0.02)
+    assert change["u_rate"] == pytest.approx(change["u_size"] / 165, rel=0.05)
     assert found["found"]["Sxx"]["scale"] == pytest.approx(26154 + 431, abs=5)
