@@ -8,10 +8,10 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run fleet test test-quick test-thorough test-all nightly lint bench faults faults-short soak lock deb container site clean
 
-$(VENV)/runtime: requirements.lock pyproject.toml
+$(VENV)/runtime: requirements.lock requirements-build.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock -r requirements-build.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --editable .
 	touch $@
 
@@ -94,10 +94,18 @@ $(VENV)-docs/done: requirements-docs.lock
 site: $(VENV)-docs/done  ## the documentation as a site, into dist/site; a warning is an error
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict
 
-lock:  ## make the lock files anew (needs uv)
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --extra build pyproject.toml -o requirements.lock
-	uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate --extra build --extra dev --extra bench -c requirements.lock pyproject.toml -o requirements-dev.lock
-	echo 'mkdocs-material>=9.7,<10' | uv pip compile --universal --python-version 3.11 --generate-hashes --no-annotate - -o requirements-docs.lock
+COMPILE = UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate
+EXTRAS = $(shell sed -n '/^\[project.optional-dependencies\]/,/^\[project.scripts\]/s/^\([a-z0-9]*\) = .*/\1/p' pyproject.toml)
+
+lock:  ## make the lock files anew (needs uv): of a gateway, of the tools, of the build backend, of each optional part, of the site
+	$(COMPILE) pyproject.toml -o requirements.lock
+	$(COMPILE) -c requirements.lock --group build --group dev --group bench pyproject.toml -o requirements-dev.lock
+	$(COMPILE) -c requirements-dev.lock --group build -o requirements-build.lock
+	for extra in $(EXTRAS); do \
+		$(COMPILE) -c requirements.lock -c requirements-dev.lock --extra $$extra pyproject.toml \
+			$$(sed -n 's/^\([a-z0-9-]*\)==.*/--no-emit-package \1/p' requirements.lock) -o agent/setup/locks/$$extra.lock || exit 1; \
+	done
+	echo 'mkdocs-material>=9.7,<10' | $(COMPILE) - -o requirements-docs.lock
 
 clean:
 	rm -rf $(VENV) $(VENV)-docs .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

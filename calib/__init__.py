@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from calib.signal.samples import Samples
     from calib.signal.stamps import clock_from_stamps
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 __all__ = [
     "PARAMETERS",

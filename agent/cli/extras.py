@@ -25,8 +25,10 @@ from agent.terminal.text import say
 def extras(names: tuple[str, ...], wheels: Path | None, index: bool, json_to: str | None) -> int:
     """List the optional parts: what each is for, and whether it is installed. With --install, install parts.
 
+    Every file is compared with the hash in the part's lock file, which is part of fieldcal.
+
     For a gateway without network, get the wheels on another machine with the same architecture and Python version:
-    `python3 -m pip download -d DIR REQUIREMENT...`, with the requirements that --json shows.
+    `python3 -m pip download --require-hashes -r LOCK -d DIR`, with the lock file that --json shows.
 
     Exit status 2 if a PART does not exist, 1 if the installation failed.
     """

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-# What each part is for. Parts that only serve the work on fieldcal itself have no line here and are not listed.
+# What each part is for.
 PURPOSES = {
     "report": "figures of `fieldcal report`",
     "files": "Parquet and Feather files, and large CSV files read faster",
@@ -28,19 +28,21 @@ PURPOSES = {
     "mqtt": "driver mqtt, and results to an MQTT broker (needs a broker besides)",
     "ni": "driver ni (needs NI-DAQmx besides; x86_64 only)",
 }
+LOCKS = Path(__file__).with_name("locks")  # `make lock` writes them
 WHEELS = Path(sys.prefix) / "wheels"  # where an installation without network keeps wheels of optional parts
 _REQUIREMENT = re.compile(r"""(?P<name>[\w.-]+)(?P<versions>[^;]*);.*\bextra\s*==\s*["'](?P<extra>[\w-]+)["']""")
 
 
 @dataclass(frozen=True, slots=True)
 class Extra:
-    """One optional part. `requirements`: names with their versions, as pip takes them; `missing`: names that are not
-    installed."""
+    """One optional part. `requirements`: names with their versions, as the metadata state them; `missing`: names that
+    are not installed; `lock`: the file that names all packages that are installed for it, with their hashes."""
 
     name: str
     purpose: str
     requirements: tuple[str, ...]
     missing: tuple[str, ...]
+    lock: str
 
     @property
     def installed(self) -> bool:
@@ -61,6 +63,7 @@ def extras() -> list[Extra]:
             PURPOSES[name],
             tuple(requirement for _, requirement in needed),
             tuple(package for package, _ in needed if not _is_installed(package)),
+            str(LOCKS / f"{name}.lock"),
         )
         for name, needed in found.items()
         if needed
@@ -68,7 +71,8 @@ def extras() -> list[Extra]:
 
 
 def install_command(chosen: Sequence[Extra], wheels: Path | None) -> list[str] | None:
-    """The command that installs the parts: from the wheels in a directory alone, or (None) from the package index.
+    """The command that installs the parts by their lock files: from the wheels in a directory alone, or (None) from the
+    package index. pip refuses a file whose hash is not in the lock file.
 
     Without a pip of its own, as in the Debian package, the one of the system is used. None where there is none.
     """
@@ -79,8 +83,8 @@ def install_command(chosen: Sequence[Extra], wheels: Path | None) -> list[str] |
     else:
         return None
     source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
-    needed = [requirement for extra in chosen for requirement in extra.requirements]
-    return [*pip, "install", "--disable-pip-version-check", *source, *needed]
+    locks = [word for extra in chosen for word in ("--requirement", extra.lock)]
+    return [*pip, "install", "--disable-pip-version-check", "--require-hashes", *source, *locks]
 
 
 def _is_installed(package: str) -> bool:

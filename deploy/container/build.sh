@@ -42,7 +42,7 @@ fi
 arch=$(dpkg-deb -f "$package" Architecture) version=$(dpkg-deb -f "$package" Version)
 mkdir -p "$work/context/data" "$output"
 dpkg-deb -x "$package" "$work/unpacked"
-mv "$work/unpacked/opt" "$work/context/opt"
+mv "$work/unpacked/opt" "$work/unpacked/usr/share/doc/fieldcal/copyright" "$work/context"
 
 if [ -z "$base" ]; then
     release=$(. /etc/os-release && echo "$VERSION_CODENAME")

@@ -7,6 +7,9 @@
 #
 #   --version V   default: version of the project, ~deb and the number of this Debian release
 #   --site DIR    take the packages in DIR instead of installing those of requirements.lock
+#
+# The same revision gives the same bytes in every directory. SOURCE_DATE_EPOCH is the time of all files; default: that of the
+# last commit.
 set -eu
 cd "$(dirname "$0")/../.."
 root=$PWD
@@ -33,8 +36,8 @@ if [ -z "$version" ]; then
     number=$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
     version=$number~deb$(. /etc/os-release && echo "$VERSION_ID")
 fi
-SOURCE_DATE_EPOCH=$(git log -1 --format=%ct 2>/dev/null || date +%s)
-export SOURCE_DATE_EPOCH
+: "${SOURCE_DATE_EPOCH:=$(git log -1 --format=%ct 2> /dev/null || date +%s)}"
+export SOURCE_DATE_EPOCH LC_ALL=C PYTHONHASHSEED=0
 
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
@@ -61,9 +64,11 @@ else
         --implementation cp --python-version "3.$minor" $platforms --target "$packages" -r requirements.lock
 fi
 "$builder" -m hatchling build -t wheel -d "$work" > /dev/null 2>&1
+# Programs of the packages begin with the path of this builder. They are not shipped, so they are not recorded either.
+find "$packages" -path '*.dist-info/RECORD' -exec sed -i '/^\.\.\/\.\.\/bin\//d' {} +
 rm -rf "$packages"/bin "$packages"/agent "$packages"/calib "$packages"/hw "$packages"/fieldcal-*.dist-info
 "$python" -m zipfile -e "$work"/fieldcal-*.whl "$packages"
-"$python" -m compileall -q -j 0 -s "$stage" -p / --invalidation-mode unchecked-hash "$packages"
+"$python" -m compileall -q -s "$stage" -p / --invalidation-mode unchecked-hash "$packages"
 cat > "$venv/bin/fieldcal" <<END
 #!/opt/fieldcal/.venv/bin/python
 import sys
@@ -85,16 +90,20 @@ put deploy/completion/fieldcal.zsh usr/share/zsh/vendor-completions/_fieldcal
 put deploy/completion/fieldcal.fish usr/share/fish/vendor_completions.d/fieldcal.fish
 put deploy/zenoh/router.json5 usr/share/doc/fieldcal/examples/router.json5
 put examples/gateway.toml usr/share/doc/fieldcal/examples/gateway.toml
-put LICENSE usr/share/doc/fieldcal/copyright
+"$builder" deploy/licences/licences.py "$packages" > "$work/copyright"
+put "$work/copyright" usr/share/doc/fieldcal/copyright
 put CHANGELOG.md usr/share/doc/fieldcal/changelog
 gzip -9n "$stage/usr/share/doc/fieldcal/changelog"
 mkdir -p "$stage/usr/bin"
 ln -s /opt/fieldcal/.venv/bin/fieldcal "$stage/usr/bin/fieldcal"
-for script in postinst prerm postrm; do install -m 755 "deploy/debian/$script" "$stage/DEBIAN/$script"; done
-sed -e "s/@VERSION@/$version/; s/@ARCH@/$arch/; s/@MINOR@/$minor/; s/@NEXT@/$((minor + 1))/" \
-    -e "s/@SIZE@/$(du -sk --exclude=DEBIAN "$stage" | cut -f1)/" deploy/debian/control > "$stage/DEBIAN/control"
+for script in prerm postinst postrm; do install -m 755 "deploy/debian/$script" "$stage/DEBIAN/$script"; done
+# The size as Debian counts it, each file in whole KiB: that of the disk would depend on the file system.
+size=$(find "$stage" -path "$stage/DEBIAN" -prune -o -type f -printf '%s\n' | awk '{kib += int(($1 + 1023) / 1024)} END {print kib}')
+sed -e "s/@VERSION@/$version/; s/@ARCH@/$arch/; s/@MINOR@/$minor/; s/@NEXT@/$((minor + 1))/; s/@SIZE@/$size/" \
+    deploy/debian/control > "$stage/DEBIAN/control"
 (cd "$stage" && find . -type f ! -path './DEBIAN/*' -printf '%P\0' | sort -z | xargs -0 md5sum > DEBIAN/md5sums)
+find "$stage" -exec touch --no-dereference --date="@$SOURCE_DATE_EPOCH" {} +
 
 mkdir -p "$output"
 package=$output/fieldcal_${version}_$arch.deb
-dpkg-deb --root-owner-group -Zzstd -z9 --build "$stage" "$package"
+dpkg-deb --root-owner-group -Zzstd -z9 --threads-max=1 --build "$stage" "$package"
