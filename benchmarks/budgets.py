@@ -18,7 +18,7 @@ import time
 import msgspec
 import numpy as np
 
-from benchmarks.dates import MEAN, PAGE, U, window
+from benchmarks.dates import MEAN, U, window
 from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
 from calib.estimate.state import State
@@ -60,6 +60,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     text = f"`python -m benchmarks.budgets`, {machine()}.\n\n{table()}"
     if given.write:
-        write_part("budget cost", text, PAGE)
+        write_part("budget cost", text)
     else:
         print(text)

@@ -16,7 +16,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -30,7 +29,6 @@ from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Array, Pose
 from tests.drawn_records import UP, Truth, template, told
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 DAYS = np.arange(0.0, 40.0, 0.25)
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.02, 0.01), np.full(3, 0.5))
@@ -119,6 +117,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     text = f"`python -m benchmarks.dates`, {machine()}.\n\n{table(given.draws)}"
     if given.write:
-        write_part("dates", text, PAGE)
+        write_part("dates", text)
     else:
         print(text)

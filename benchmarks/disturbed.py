@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from benchmarks.response import BANDS_HZ, PAGE, U_REFERENCE
+from benchmarks.response import BANDS_HZ, U_REFERENCE
 from calib.estimate.nuisances import Priors
 from calib.model import Array
 from calib.recorded.adjusting import adjusted
@@ -116,7 +116,7 @@ def main() -> None:
     arguments = parser.parse_args()
     lines = table(arguments.runs)
     if arguments.write:
-        write_part("disturbed", "\n".join([*lines, "", f"{arguments.runs} runs a line; {machine()}."]), PAGE)
+        write_part("disturbed", "\n".join([*lines, "", f"{arguments.runs} runs a line; {machine()}."]))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.model_records import drawn, smoothed, templates
 from benchmarks.page import machine, write_part
-from benchmarks.ten_years import MEAN, PAGE, U, degc
+from benchmarks.ten_years import MEAN, U, degc
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
 from calib.estimate.statements import Statements, Step
@@ -85,6 +85,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     text = f"`python -m benchmarks.drawn_years`, {machine()}; {given.years} years.\n\n{table(given.years)}"
     if given.write:
-        write_part("drawn years", text, PAGE)
+        write_part("drawn years", text)
     else:
         print(text)

@@ -16,7 +16,6 @@ import argparse
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -31,7 +30,6 @@ from tests.building_windows import building_window
 from tests.clamp_windows import S_TRUE
 from tests.unit.test_estimation import estimation, hours
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 LEVELS, BEFORE, HELD = (0.1, 0.1, 0.1), 10, 5
 EYE, MAIN, TRANSVERSE = np.eye(3), 0.01, 0.005  # scatter of S between sensors
 CASES: Mapping[str, Exchange] = {
@@ -128,6 +126,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     text = f"`python -m benchmarks.exchanges`, {machine()}. {given.seeds} seeds.\n\n{table(given.seeds)}"
     if given.write:
-        write_part("exchanges", text, PAGE)
+        write_part("exchanges", text)
     else:
         print(text)

@@ -27,7 +27,6 @@ from tests.unit.zenoh_site import Site, wait_for
 GATEWAYS, SENSORS, SEED = 100, 10, 7
 ROUNDS = 8  # of all gateways, 30 days apart; a drift is told then
 HELD_FROM = BEGINS["held"]
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "fleet.md"
 DAY_NS = 86_400_000_000_000
 SCROLLS, SCROLL_PX, APART_MS = 60, 240, 50
 SETTLES_MS = 2000
@@ -129,7 +128,7 @@ def tell(runs: list[dict[str, float]], *, write: bool) -> None:
         lines.append(f"| {name} | {statistics.median(values):.3g} | {', '.join(f'{v:.3g}' for v in values)} |")
     print("\n".join(lines), flush=True)
     if write:
-        write_part("fleet page", "\n".join(lines), DOCS)
+        write_part("fleet page", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ from pathlib import Path
 
 from benchmarks.page import machine, write_part
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "fleet.md"
 FIELDCAL = [sys.executable, "-m", "agent"]
 ONE_THREAD = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
 CLUSTER = """
@@ -134,7 +133,7 @@ def measured(number: int, seconds: float, turns: int) -> str:
 
 
 def main() -> None:
-    """Measure, print, and write into docs/fleet.md with --write."""
+    """Measure, print, and write into docs/fleet-replay.md with --write."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--recordings", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -143,7 +142,7 @@ def main() -> None:
     options = parser.parse_args()
     text = f"{measured(options.recordings, options.seconds, options.turns)}\n\nMeasured on {machine()}."
     if options.write:
-        write_part("fleet-replay", text, PAGE)
+        write_part("fleet-replay", text)
     else:
         print(text)
 

@@ -18,7 +18,6 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -32,7 +31,6 @@ from calib.excitation.sums import window_sums
 from calib.geometry import STANDARD_GRAVITY_MPS2, clamp
 from calib.model import Window
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "bench.md"
 ALPHAS_DEG = tuple(range(0, 360, 15))
 FREQUENCY_HZ, AMPLITUDE_MPS2, RATE_HZ, STAY_S, NOISE_MPS2 = 3.0, 10.0, 200.0, 10.0, 0.02
 SEGMENT_S = 0.5
@@ -275,7 +273,7 @@ def bounds() -> list[str]:
 
 
 def main() -> None:
-    """Measure and print, with --write into docs/bench.md."""
+    """Measure and print, with --write into docs/bench-evidence.md."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--users", type=int, default=200)
     parser.add_argument("--write", action="store_true")
@@ -284,7 +282,7 @@ def main() -> None:
         [f"{options.users} simulated users, {machine()}.\n", *figures(options.users), *outlooks(), *bounds()]
     )
     if options.write:
-        write_part("guided", text, PAGE)
+        write_part("guided", text)
     else:
         print(text)
 

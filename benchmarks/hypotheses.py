@@ -19,7 +19,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 from collections import Counter
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 import numpy as np
 
@@ -33,7 +32,6 @@ from calib.estimate.wander import TemperatureModel, Wander
 from hw.virtual.schedule import rotation
 from tests.building_windows import building_window
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 SIZES, KINDS = (0.003, 0.005, 0.01, 0.03), ("sensor", "reference in use", "check reference", "mount")
 BEFORE, AFTER, HELD, LEVEL = 20, 30, 5, (0.3, 0.3, 0.3)
 WEAK, SINCE = (0.03, 0.03, 0.03), 12  # motion of a bridge on a calm day, and windows since a change
@@ -132,6 +130,6 @@ if __name__ == "__main__":
     text += f"\n\nOf a shape: right, as fitting alike, another one, none, of {given.seeds}.\n\n"
     text += table("change", shape, SHAPES, given.seeds, "right", "alike", "wrong", "none")
     if given.write:
-        write_part("hypotheses", text, PAGE)
+        write_part("hypotheses", text)
     else:
         print(text)

@@ -1,6 +1,6 @@
 """What each driver on I2C or SPI reads on each kind of adapter: highest rate, bytes on the bus, CPU time.
 
-`python -m benchmarks.i2c_rates [--write]`; with --write the table goes into docs/gateway.md. Time is simulated: a
+`python -m benchmarks.i2c_rates [--write]`; with --write the table goes into docs/devices.md. Time is simulated: a
 transfer takes 9 bits a byte (SPI: 8) at the clock of the bus, and the time that the adapter adds. The highest rate is
 the highest of the driver's rates that the options accept at this clock, that the driver accepts on this adapter, and
 that it then reads for SECONDS without a loss. CPU is that of the driver, without the twin and without the kernel.
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,6 @@ from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.spi_bus import SPI, Controller, SpiBus
 
 SECONDS = 20.0
-GATEWAY = Path(__file__).resolve().parents[1] / "docs" / "gateway.md"
 TWINS: dict[str, type[FifoTwin]] = {
     "adxl355": Adxl355Twin,
     "adxl345": Adxl345Twin,
@@ -172,7 +170,7 @@ def main() -> None:
     given = parser.parse_args()
     text = f"{table()}\n\n{machine()}; `python -m benchmarks.i2c_rates`."
     if given.write:
-        write_part("i2c rates", text, GATEWAY)
+        write_part("i2c rates", text)
     else:
         print(text)
 

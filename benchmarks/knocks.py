@@ -18,7 +18,6 @@ import argparse
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from benchmarks.response import PAGE
 from calib.model import Array
 from tests.stays import MAIN, S_TRUE, in_batches, knocked, main_errors_pct, stays
 
@@ -78,7 +77,7 @@ def main() -> None:
     arguments = parser.parse_args()
     lines = table(arguments.runs)
     if arguments.write:
-        write_part("knocks", "\n".join([*lines, "", f"{arguments.runs} runs a line; {machine()}."]), PAGE)
+        write_part("knocks", "\n".join([*lines, "", f"{arguments.runs} runs a line; {machine()}."]))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from agent.core.noise_watch import FIRST, Noise
 from benchmarks.page import machine, write_part
 from calib.model import Array
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 FLOOR_MPS2, LEVEL_MPS2 = 0.005, 0.02
 YEAR, LATER = 8760, 240  # windows
 
@@ -100,6 +98,6 @@ if __name__ == "__main__":
     text = f"`python -m benchmarks.noise`, {machine()}. {given.seeds} seeds, an hour between windows.\n\n"
     text += table(given.seeds)
     if given.write:
-        write_part("noise", text, PAGE)
+        write_part("noise", text)
     else:
         print(text)

@@ -18,7 +18,6 @@ import multiprocessing
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from benchmarks.response import PAGE
 from hw.virtual.spread import Spread, drawn
 from tests.one_frequency import ANGLES, at_frequency, bench, calibrated, stated
 
@@ -73,7 +72,7 @@ def main() -> None:
             lines.append(line(motion_hz, corner_hz, order, pool.map(one, jobs, chunksize=1)))
             print(lines[-1], flush=True)
     if options.write:
-        write_part("one frequency", "\n".join([*lines, "", f"{options.runs} runs a line; {machine()}."]), PAGE)
+        write_part("one frequency", "\n".join([*lines, "", f"{options.runs} runs a line; {machine()}."]))
 
 
 if __name__ == "__main__":

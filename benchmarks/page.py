@@ -6,7 +6,7 @@ import os
 import platform
 from pathlib import Path
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 def machine() -> str:
@@ -16,16 +16,16 @@ def machine() -> str:
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 
-def write_part(name: str, text: str, at: Path = PAGE) -> None:
-    """Put `text` between the markers of `name`, and print it.
+def write_part(name: str, text: str) -> None:
+    """Put `text` between the markers of `name`, in the page that has them, and print it.
 
-    Raises ValueError if the page does not have these markers.
+    Raises ValueError if not exactly one page has these markers.
     """
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    page = at.read_text()
-    if begin not in page or end not in page:
-        raise ValueError(f"{at} does not have the markers {begin} and {end}")
-    head, rest = page.split(begin, 1)
+    pages = [page for page in sorted(DOCS.glob("*.md")) if begin in page.read_text() and end in page.read_text()]
+    if len(pages) != 1:
+        raise ValueError(f"{len(pages)} pages of {DOCS} have the markers {begin} and {end}")
+    head, rest = pages[0].read_text().split(begin, 1)
     tail = rest.split(end, 1)[1]
-    at.write_text(f"{head}{begin}\n{text.strip()}\n{end}{tail}")
+    pages[0].write_text(f"{head}{begin}\n{text.strip()}\n{end}{tail}")
     print(text)

@@ -20,7 +20,6 @@ import argparse
 import itertools
 import multiprocessing
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,6 @@ from tests.pair import (
     sinc3,
 )  # fmt: skip
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "response.md"
 U_REFERENCE = 1e-3
 BANDS_HZ = ((0.3, 2.0), (0.5, 20.0), (1.0, 40.0))
 RATIOS = (1.5, 2.0, 5.0, 20.0)  # of a filter's corner over the upper end of the motion
@@ -295,7 +293,7 @@ def main() -> None:
     lines = TABLES[arguments.of](arguments.runs)
     if arguments.write:
         text = "\n".join([*lines, "", f"{arguments.runs} runs a {OF[arguments.of]}; {machine()}."])
-        write_part(arguments.of, text, PAGE)
+        write_part(arguments.of, text)
 
 
 if __name__ == "__main__":

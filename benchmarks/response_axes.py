@@ -19,7 +19,7 @@ import itertools
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from benchmarks.response import PAGE, U_REFERENCE
+from benchmarks.response import U_REFERENCE
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import REFERENCE
 from calib.model import Array
@@ -82,7 +82,7 @@ def main() -> None:
     arguments = parser.parse_args()
     lines = table(arguments.runs)
     if arguments.write:
-        write_part("axes", "\n".join([*lines, "", f"{arguments.runs} runs a line; {machine()}."]), PAGE)
+        write_part("axes", "\n".join([*lines, "", f"{arguments.runs} runs a line; {machine()}."]))
 
 
 if __name__ == "__main__":

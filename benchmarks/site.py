@@ -20,7 +20,6 @@ import resource
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -33,7 +32,6 @@ from calib.estimate.site import Site
 from calib.model import Pose, Window, WindowSums
 from tests.dense_site import RATE_HZ, SAMPLES, SimulatedSite, Stated, turned
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "fleet.md"
 NOMINAL = np.append(np.eye(3).ravel(), np.zeros(3))
 PRIOR = np.diag(np.append(np.full(9, 0.2), np.full(3, 5.0)) ** 2)
 SENSORS, REFERENCES, POSITIONS = 200, 5, 3
@@ -228,7 +226,7 @@ def large() -> str:
 
 
 def main() -> None:
-    """Run, print, and write into docs/fleet.md with --write."""
+    """Run, print, and write into docs/site.md with --write."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--large", action="store_true")
@@ -250,7 +248,7 @@ def main() -> None:
         )
     text = f"{text}\n\nMeasured on {machine()}."
     if options.write:
-        write_part(name, text, PAGE)
+        write_part(name, text)
     else:
         print(text)
 

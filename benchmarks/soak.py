@@ -35,7 +35,6 @@ from hw.virtual.serial_port import PtyDevice
 from hw.virtual.timebase import BenchTime
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "reliability.md"
 SEED = 1
 SAMPLE_S = 5.0
 SETTLE_S = 0.5  # a reader discards what arrives before its port is set up
@@ -245,7 +244,7 @@ def main() -> None:
     parser.add_argument("--part", required=True, help="markers in docs/reliability.md")
     options = parser.parse_args()
     soaked = soak(options.hours, options.speed, options.rate_hz, options.router_port)
-    write_part(options.part, table(soaked), PAGE)
+    write_part(options.part, table(soaked))
 
 
 if __name__ == "__main__":

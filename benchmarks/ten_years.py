@@ -16,7 +16,6 @@ import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -31,7 +30,6 @@ from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
 from tests.clamp_windows import G_MPS2
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "online.md"
 YEARS, YEAR_DAYS, EVERY_DAYS, MERGED_DAYS = 10, 365.0, 2.0, 10.0
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.02, 0.01), np.full(3, 0.5))
@@ -136,6 +134,6 @@ if __name__ == "__main__":
     parser.add_argument("--write", action="store_true")
     text = f"`python -m benchmarks.ten_years`, {machine()}.\n\n{table()}"
     if parser.parse_args().write:
-        write_part("ten years", text, PAGE)
+        write_part("ten years", text)
     else:
         print(text)

@@ -35,7 +35,6 @@ from benchmarks.page import machine, write_part
 from calib.estimate.next_stop import MAIN, Wanted
 from hw.virtual.visits import RATE_HZ, REFERENCE, Clamped, Structure, StructureParameters
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "visit.md"
 SENSOR = "sensor-1"
 BURST = 32
 U_MAIN, U_TRANSVERSE, U_TURNED_DEG, U_REFERENCE, U_OFFSET_MPS2 = 0.02, 0.01, 0.2, 0.001, 0.05
@@ -177,7 +176,7 @@ def main() -> None:
     arguments = parser.parse_args()
     text = "\n".join(figures(arguments.visits))
     if arguments.write:
-        write_part("visits", text, PAGE)
+        write_part("visits", text)
     else:
         print(text)
 

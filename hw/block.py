@@ -85,7 +85,7 @@ class DeviceInfo:
     nominal_sensitivity: float | None = None  # indications per m/s2, from the data sheet
     settings: dict[str, str] = field(default_factory=dict)  # register contents or port settings, as read back
     # Known filters as set, one after the other, each a line such as "lowpass order=2 corner_hz=31 u_corner_pct=10"
-    # (docs/calibrate.md, "Known filters"); empty where no data sheet tells them.
+    # (docs/frequency.md, "Known filters"); empty where no data sheet tells them.
     filters: tuple[str, ...] = ()
     filter_settings: tuple[str, ...] = ()  # names of the settings that change nothing but the rate and these filters
     own_clock: bool = False  # the stamps are of played or simulated data, whose time runs faster or slower than here

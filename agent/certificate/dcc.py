@@ -1,6 +1,6 @@
 """The certificate as a digital calibration certificate (DCC 3.2.1 of PTB) with quantities in D-SI 2.1.
 
-No schema is read: the order of the elements is that of the schema, and docs/certificate.md says how to validate.
+No schema is read: the order of the elements is that of the schema. docs/certificate-content.md says how to validate.
 """
 
 from __future__ import annotations

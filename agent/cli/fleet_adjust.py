@@ -35,7 +35,7 @@ def adjust(
 ) -> int:
     """Adjust all sensors and references of a site together, and name the one that contradicts the others.
 
-    SITE.toml lists who met whom, with files (docs/fleet.md). Recordings of gateways need no such list.
+    SITE.toml lists who met whom, with files (docs/site.md). Recordings of gateways need no such list.
 
     Exit status 0 if no device contradicts the others, 2 on bad input, 3 if one does, or if no link can be used.
     """

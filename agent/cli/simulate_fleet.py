@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from agent.fleet.simulated import Stop
     from agent.fleet.simulated_processes import FleetProcesses
 
-FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; docs/fleet.md has what was measured
+FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; measured in docs/fleet-evidence.md
 ROUTER_S = 30.0  # s to wait for a router
 STEP_S = 0.5
 DAY_S = 86400.0

@@ -125,7 +125,7 @@ class Consumer:
             self._questions = Questions(session, self._inbox.put)
             # A plain one: an advanced subscriber asks each publisher of each gateway for its history after a lost
             # connection and gets heartbeats of all of them, which a router of 1,000 gateways cannot stand
-            # (docs/fleet.md).
+            # (docs/fleet-evidence.md).
             subscriber = session.declare_subscriber(self._key, zenoh.handlers.RingChannel(INBOX))
             opened.callback(subscriber.undeclare)
             self._presence = Presence(session, self._key, lambda: self._inbox.put(_Wake.NEWS))

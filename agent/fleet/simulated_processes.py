@@ -19,7 +19,7 @@ from agent.fleet.simulated import SimulatedFleet
 from agent.fleet.simulated_sensor import Behaviour
 from agent.fleet.workers import begin
 
-# Gateways in one process, with two threads each that wake up 15 times a second. docs/fleet.md has what more would cost.
+# Gateways in one process, with two threads each that wake up 15 times a second. docs/fleet-evidence.md: what more cost.
 GATEWAYS_EACH = 100
 LEAVE_S = 3.0  # to end in order, once they are to stop; then what is left is killed: a router sees its gateways leave
 NICE = 10  # gateways are other machines: simulated ones leave the processor to a router and a monitor on this one

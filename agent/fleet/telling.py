@@ -51,7 +51,7 @@ def _size(found: Adjusted, bad: Verdict) -> str:
 
 
 def as_object(found: Adjusted, between: Sequence[tuple[str, str]]) -> dict[str, Any]:
-    """The members of the JSON object of docs/fleet.md."""
+    """The members of the JSON object of docs/site.md."""
     refused = reasons(found)
     return {
         "status": "refused" if refused else "valid",

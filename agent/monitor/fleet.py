@@ -24,7 +24,7 @@ from calib.model import PARAMETERS
 NEEDS_A_PERSON = ("INVALID", "HELD", "UNCALIBRATED")
 CALM = ("running", "catching up")  # states of a gateway that need no person
 LARGEST = 1e6  # change in units of U; a stranger may send numbers whose quotient is not finite
-# A stranger may invent gateways and sensors for ever, so their numbers are bounded: ten times what docs/fleet.md plans.
+# A stranger may invent gateways and sensors for ever. So there is a bound: ten times those of docs/fleet-evidence.md.
 SENSORS_MAX = 40_000
 GATEWAYS_MAX = 10_000
 TEXT_MAX = 800  # characters of a reason that are shown; what explains held windows has some 450

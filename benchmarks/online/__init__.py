@@ -13,5 +13,5 @@
     run.close()
 
 `python -m benchmarks.online [NAME ...] [--write]` runs the scenarios and prints their tables; `--write` puts them into
-docs/online.md.
+docs/online-evidence.md.
 """

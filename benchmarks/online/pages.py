@@ -1,4 +1,4 @@
-"""Runs the scenarios and writes their results into docs/online.md (the cost into docs/performance.md)."""
+"""Runs the scenarios and writes their results into the pages of docs/ that have their markers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any
 
 from benchmarks.online import (
@@ -27,11 +26,9 @@ from benchmarks.online import (
     touched,
     year,
 )
-from benchmarks.page import PAGE, machine, write_part
+from benchmarks.page import machine, write_part
 from hw.virtual.building import Building
 from hw.virtual.harm_kinds import KINDS
-
-ONLINE, RESPONSE = PAGE.with_name("online.md"), PAGE.with_name("response.md")
 
 
 def main() -> int:
@@ -49,10 +46,10 @@ def main() -> int:
     options = parser.parse_args()
     for name in options.names or PARTS:
         begin = time.monotonic()
-        page, text = PARTS[name](options.workers, options.runs)
+        text = PARTS[name](options.workers, options.runs)
         text = f"`python -m benchmarks.online {name}`, {machine()}.\n\n{text}"
         if options.write:
-            write_part(name, text, page)
+            write_part(name, text)
         else:
             print(text)
         print(f"[{name}: {time.monotonic() - begin:.0f} s]\n", flush=True)
@@ -67,54 +64,54 @@ def spread(work: Callable[[Any], Any], items: Sequence[Any], workers: int) -> li
         return list(pool.map(work, items, chunksize=max(1, len(items) // (8 * workers))))
 
 
-def _harm(workers: int, runs: int | None) -> tuple[Path, str]:
+def _harm(workers: int, runs: int | None) -> str:
     count = runs or 1000
     kinds = list(KINDS)
     jobs = [(kinds[k % len(kinds)], harm.SEED + k) for k in range(count)]
     jobs += [("", harm.SEED + 100_000 + k) for k in range(count)]
     outcomes = spread(_one_harm, jobs, workers)
     wrong = [f"- {o.kind} ({o.name}), seed {o.seed}: {o.wrong}" for o in outcomes if o.wrong]
-    return ONLINE, "\n".join([harm.table(outcomes), "", *wrong])
+    return "\n".join([harm.table(outcomes), "", *wrong])
 
 
-def _filters(workers: int, runs: int | None) -> tuple[Path, str]:
-    return RESPONSE, filters.table(spread(filters.one, filters.jobs(runs or filters.RUNS), workers))
+def _filters(workers: int, runs: int | None) -> str:
+    return filters.table(spread(filters.one, filters.jobs(runs or filters.RUNS), workers))
 
 
-def _lorries(workers: int, runs: int | None) -> tuple[Path, str]:
+def _lorries(workers: int, runs: int | None) -> str:
     count = runs or lorries.RUNS
     records = [(order, seed) for order in lorries.RECORDS for seed in range(count)]
     whole = lorries.table(spread(lorries.one, lorries.jobs(count), workers))
-    return ONLINE, f"{lorries.records_table(spread(lorries.of_records, records, workers))}\n\n{whole}"
+    return f"{lorries.records_table(spread(lorries.of_records, records, workers))}\n\n{whole}"
 
 
-def _bridge(workers: int, runs: int | None) -> tuple[Path, str]:
-    return ONLINE, bridge.table(spread(bridge.one, bridge.jobs(runs or bridge.RUNS), workers))
+def _bridge(workers: int, runs: int | None) -> str:
+    return bridge.table(spread(bridge.one, bridge.jobs(runs or bridge.RUNS), workers))
 
 
-def _chip(workers: int, runs: int | None) -> tuple[Path, str]:
-    return RESPONSE, chip.table(spread(chip.one, chip.jobs(runs or chip.RUNS), workers))
+def _chip(workers: int, runs: int | None) -> str:
+    return chip.table(spread(chip.one, chip.jobs(runs or chip.RUNS), workers))
 
 
 def _one_harm(job: tuple[str, int]) -> harm.Outcome:
     return harm.harmed(*job)
 
 
-def _coverage(workers: int, runs: int | None) -> tuple[Path, str]:
+def _coverage(workers: int, runs: int | None) -> str:
     seeds = range(coverage.SEED, coverage.SEED + (runs or coverage.RUNS))
-    return ONLINE, coverage.table(spread(coverage.one, seeds, workers))
+    return coverage.table(spread(coverage.one, seeds, workers))
 
 
-def _touched(workers: int, runs: int | None) -> tuple[Path, str]:
+def _touched(workers: int, runs: int | None) -> str:
     counts = [runs or line.runs for line in touched.LINES]
     told = iter(spread(touched.one, [(line, seed) for line, n in enumerate(counts) for seed in range(n)], workers))
-    return ONLINE, touched.table([[next(told) for _ in range(n)] for n in counts])
+    return touched.table([[next(told) for _ in range(n)] for n in counts])
 
 
-def _year(workers: int, runs: int | None) -> tuple[Path, str]:
+def _year(workers: int, runs: int | None) -> str:
     windows = runs or 8760
     found = spread(_one_year, [(windows, 0.0), (windows, 0.05)], min(workers, 2))
-    return ONLINE, year.table(dict(zip(["y alone", "5 % in other directions"], found, strict=True)))
+    return year.table(dict(zip(["y alone", "5 % in other directions"], found, strict=True)))
 
 
 def _one_year(job: tuple[int, float]) -> dict[str, str]:
@@ -123,54 +120,54 @@ def _one_year(job: tuple[int, float]) -> dict[str, str]:
     return year.facts(building, year.whole(building, range(windows)))
 
 
-def _day(_workers: int, _runs: int | None) -> tuple[Path, str]:
-    return ONLINE, day.table()
+def _day(_workers: int, _runs: int | None) -> str:
+    return day.table()
 
 
-def _bench(workers: int, runs: int | None) -> tuple[Path, str]:
+def _bench(workers: int, runs: int | None) -> str:
     seeds = range(bench.SEED, bench.SEED + (runs or bench.RUNS))
     tables = [
         bench.table(spread(functools.partial(bench.day, rate_hz=rate_hz), seeds, workers), rate_hz)
         for rate_hz in bench.RATES_HZ
     ]
     tables.append(bench.free_table(spread(bench.free_day, seeds, workers)))
-    return ONLINE, "\n\n".join(tables)
+    return "\n\n".join(tables)
 
 
-def _agreement(workers: int, runs: int | None) -> tuple[Path, str]:
+def _agreement(workers: int, runs: int | None) -> str:
     seeds = range(agreement.SEED, agreement.SEED + (runs or agreement.RUNS))
     rows = [
         agreement.table(spread(one, seeds, workers), kind)
         for kind, one in (("bench day", agreement.bench_day), ("building", agreement.building))
     ]
-    return ONLINE, "\n".join([agreement.HEADER, *rows])
+    return "\n".join([agreement.HEADER, *rows])
 
 
-def _drift(workers: int, runs: int | None) -> tuple[Path, str]:
+def _drift(workers: int, runs: int | None) -> str:
     seeds = range(drifting.SEED, drifting.SEED + (runs or drifting.RUNS))
     rows = [
         drifting.table(spread(functools.partial(drifting.one, rate_pct=rate_pct), seeds, workers), rate_pct)
         for rate_pct in (drifting.RATE_PCT, 0.0)
     ]
-    return ONLINE, "\n".join([drifting.HEADER, *rows])
+    return "\n".join([drifting.HEADER, *rows])
 
 
-def _references(workers: int, runs: int | None) -> tuple[Path, str]:
+def _references(workers: int, runs: int | None) -> str:
     seeds = range(references.SEED, references.SEED + (runs or references.RUNS))
     jobs = {name: [(role, seed, True) for seed in seeds] for name, role in references.KINDS.items()}
-    return ONLINE, references.table([(name, spread(references.one, own, workers)) for name, own in jobs.items()])
+    return references.table([(name, spread(references.one, own, workers)) for name, own in jobs.items()])
 
 
-def _temperature(workers: int, runs: int | None) -> tuple[Path, str]:
+def _temperature(workers: int, runs: int | None) -> str:
     lines = temperature.jobs(runs or temperature.RUNS)
-    return ONLINE, temperature.table([spread(temperature.one, own, workers) for own in lines])
+    return temperature.table([spread(temperature.one, own, workers) for own in lines])
 
 
-def _cost(_workers: int, runs: int | None) -> tuple[Path, str]:
-    return PAGE, cost.table(cost.measure(runs or cost.TIMING.windows))
+def _cost(_workers: int, runs: int | None) -> str:
+    return cost.table(cost.measure(runs or cost.TIMING.windows))
 
 
-PARTS: dict[str, Callable[[int, int | None], tuple[Path, str]]] = {
+PARTS: dict[str, Callable[[int, int | None], str]] = {
     "bench": _bench,
     "agreement": _agreement,
     "year": _year,

@@ -27,7 +27,7 @@ GRAVITY = np.array([0.0, 0.0, 9.80665])  # as stated in the configuration
 
 
 def parameters(seed: int, elsewhere: float = 0.0) -> BuildingParameters:
-    """The building of docs/online.md; quantities that are not known exactly are drawn."""
+    """The building of docs/online-evidence.md; quantities that are not known exactly are drawn."""
     random = np.random.default_rng([seed, 3])
     sensitivity = np.eye(3) + np.where(np.eye(3), 0.01, 0.005) * random.standard_normal((3, 3))
     step = np.zeros((3, 3))

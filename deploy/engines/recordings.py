@@ -4,8 +4,8 @@
 
 Each revision of deploy/engines/earlier.py runs its own `fieldcal run` on its own virtual bench, in real time, signed
 where it can be. DIRECTORY then holds `engines`, a directory for each recording, and `gateway.pub`. The program of today
-audits each recording twice, and prints the table of docs/audit.md. An old revision may end with a fault of its own on a
-busy machine: delete its recording and run this again, which makes what is missing.
+audits each recording twice, and prints the table of docs/recording-evidence.md. An old revision may end with a fault of
+its own on a busy machine: delete its recording and run this again, which makes what is missing.
 """
 
 from __future__ import annotations

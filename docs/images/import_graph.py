@@ -180,7 +180,7 @@ def main() -> None:
     """Write the drawing and the list."""
     imports = imports_of_rooms()
     DRAWING.write_text(drawing(imports), encoding="utf-8")
-    write_part("imports", table(imports), PAGE)
+    write_part("imports", table(imports))
 
 
 if __name__ == "__main__":

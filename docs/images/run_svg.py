@@ -1,6 +1,6 @@
 """Makes run.svg, the README's picture: a real run on the virtual bench, as the terminal shows it after a minute.
 
-.venv/bin/python docs/images/run_svg.py
+`.venv/bin/python -m docs.images.run_svg`
 """
 
 from __future__ import annotations
@@ -37,4 +37,5 @@ def main() -> None:
         console.save_svg(str(HERE / "run.svg"), title="make run")
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -37,6 +37,7 @@ def configuration() -> Iterator[str]:
 
     yield from _head(
         "Configuration",
+        "find each setting of a configuration, with its unit, default and limits",
         "Every section and every setting of the file that `fieldcal run` reads. `fieldcal check` tests a file, "
         "`fieldcal init` writes one; [gateway.md](../gateway.md#2-configuration) explains how to begin.",
     )
@@ -73,6 +74,7 @@ def drivers() -> Iterator[str]:
 
     yield from _head(
         "Drivers",
+        "find each option of each driver",
         "What `fieldcal sensors` prints: the drivers that come with fieldcal, each with its options: name, unit, "
         "default, values, meaning. [gateway.md](../gateway.md#1-devices) says which device needs which driver.",
     )
@@ -87,7 +89,7 @@ def commands() -> Iterator[str]:
     """Every command with its options."""
     from agent.cli.main import fieldcal
 
-    yield from _head("Commands", "What `fieldcal COMMAND --help` prints.")
+    yield from _head("Commands", "find each option of each command", "What `fieldcal COMMAND --help` prints.")
     settings = fieldcal.context_settings | {"terminal_width": WIDTH, "max_content_width": WIDTH}
     context = click.Context(fieldcal, info_name="fieldcal", **settings)
     yield from _helps(fieldcal, context)
@@ -110,6 +112,7 @@ def messages() -> Iterator[str]:
 
     yield from _head(
         "Messages",
+        "read each field of a result, an event or a message",
         "Every field of every result (published over Zenoh as JSON under `fieldcal/v1/SITE/GATEWAY/SENSOR/WHAT`, and "
         "recorded), of every event (recorded under `/events`), and of the guide of `fieldcal bench`. "
         "[recording.md](../recording.md) explains the file, "
@@ -152,6 +155,7 @@ def python() -> Iterator[str]:
 
     yield from _head(
         "`import calib`",
+        "call each public name of `calib`",
         "All public names with their docstrings. [api.md](../api.md) shows how they work together, with examples that "
         "run as tests.",
     )
@@ -175,9 +179,10 @@ def _signature(name: str, found: Any) -> str:
     return f"{name}(\n" + "".join(f"    {part},\n" for part in parts) + ")" + after
 
 
-def _head(title: str, text: str) -> list[str]:
+def _head(title: str, after: str, text: str) -> list[str]:
+    """Title, what the reader can do after the page, and an introduction."""
     made = "<!-- made from the code by `python -m docs.reference.pages`; do not edit -->"
-    return [f"# {title}", "", made, "", *textwrap.wrap(text, WIDTH + 20), ""]
+    return [f"# {title}", "", f"After this page you can {after}.", "", made, "", *textwrap.wrap(text, WIDTH + 20), ""]
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:

@@ -59,6 +59,8 @@ def _introduction() -> str:
     )
     return f"""# The paper on the virtual bench
 
+After this page you can compare the results of fieldcal with those of the paper.
+
 `python examples/paper.py` writes this page, with fixed seeds; do not edit it. The paper is: D'Emilia, Gaspari,
 Mazzoleni, Natale and Schiavi, *Calibration of tri-axial MEMS accelerometers in the low-frequency range, Part 1:
 comparison among methods*, J. Sens. Sens. Syst. 7, 2018.

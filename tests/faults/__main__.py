@@ -68,7 +68,7 @@ def _write(outcome: Outcome) -> None:
     rows = {line.split(" | ", 1)[0]: line for line in known}
     day = time.strftime("%Y-%m-%d", time.gmtime())
     rows[f"| {outcome.line}"] = row(outcome, day)
-    write_part(PART, f"{machine()}\n\n{HEAD}\n" + "\n".join(rows.values()), PAGE)
+    write_part(PART, f"{machine()}\n\n{HEAD}\n" + "\n".join(rows.values()))
 
 
 if __name__ == "__main__":

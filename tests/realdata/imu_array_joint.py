@@ -64,7 +64,7 @@ def rotation(imu: int) -> Array:
 
 
 def main() -> None:
-    """The figures of docs/fleet.md."""
+    """The figures of docs/site.md."""
     others = tuple(range(2, IMUS + 1))
     for recording in (1, 2, 3):
         time_s, counts = rests(recording)

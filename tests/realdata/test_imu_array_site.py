@@ -83,7 +83,7 @@ def test_an_imu_gets_s_and_q_from_the_certificate_of_another(recording: int, tmp
 
 
 def main() -> None:
-    """The figures of docs/fleet.md: all IMUs, all recordings."""
+    """The figures of docs/site.md: all IMUs, all recordings."""
     import tempfile
 
     every = []

@@ -1,4 +1,4 @@
-"""U on-line covers the truth: a few runs here, 300 in docs/online.md (`python -m benchmarks.online coverage`)."""
+"""U on-line covers the truth: a few here, 300 in docs/online-evidence.md (`python -m benchmarks.online coverage`)."""
 
 from __future__ import annotations
 

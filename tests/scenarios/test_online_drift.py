@@ -1,4 +1,4 @@
-"""A drift of S far faster than stated; docs/online.md has more runs (`python -m benchmarks.online drift`)."""
+"""A drift of S far faster than stated; docs/online-evidence.md has more runs (`python -m benchmarks.online drift`)."""
 
 from __future__ import annotations
 

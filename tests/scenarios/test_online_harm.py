@@ -1,6 +1,6 @@
 """Faults of sensor or reference do not change S and Q in force; harmless windows are used.
 
-Here two runs of each kind of fault; docs/online.md has a thousand (`python -m benchmarks.online harm`).
+Here two runs of each kind of fault; docs/online-evidence.md has a thousand (`python -m benchmarks.online harm`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A gateway that is touched: what an exact batch says, and short lives against it.
 
-docs/online.md has 100 lives of each kind (`python -m benchmarks.online touched`).
+docs/online-evidence.md has 100 lives of each kind (`python -m benchmarks.online touched`).
 """
 
 from __future__ import annotations

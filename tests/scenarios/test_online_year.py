@@ -1,6 +1,6 @@
 """Three months of a year in a building, with a short window each day: the step is found, all else stays.
 
-docs/online.md has the whole year with a window each hour (`python -m benchmarks.online year`).
+docs/online-evidence.md has the whole year with a window each hour (`python -m benchmarks.online year`).
 """
 
 from __future__ import annotations

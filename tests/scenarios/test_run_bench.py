@@ -166,4 +166,4 @@ def test_the_picture_in_the_readme_promises_what_the_agent_promises_today(run: R
     u = last["coverage_factor"] * np.array(last["standard_uncertainty"])
     now = np.column_stack([u[:9].reshape(3, 3), u[9:]])
     # One run has more windows than another where a busy machine lost samples. An old picture was wrong by 250 times.
-    assert 1 / 3 < np.median(shown / now) < 3, "make it anew: .venv/bin/python docs/images/run_svg.py"
+    assert 1 / 3 < np.median(shown / now) < 3, "make it anew: .venv/bin/python -m docs.images.run_svg"

@@ -98,7 +98,7 @@ def test_settings_exist(page: Path) -> None:
         # A fragment of a channel begins with one of its tables; TOML then needs the channel before it.
         text = "[[channels]]\n" + block if kind == "toml" and re.match(r"\[channels\.", block) else block
         table = tomllib.loads(text) if kind == "toml" else {}
-        # Other files in TOML: package, certificate, and the links of a site (docs/fleet.md).
+        # Other files in TOML: package, certificate, and the links of a site (docs/site.md).
         if set(table) & set(Config.model_fields) and "links" not in table:
             wrong += list(strangers(Config, table, ""))
     assert wrong == []

@@ -63,6 +63,39 @@ def test_every_page_is_in_the_navigation() -> None:
     assert listed - {"CONTRIBUTING.md", "CHANGELOG.md"} == there
 
 
+def guide() -> list[Path]:
+    """The pages of the guide, as the navigation lists them."""
+    part = (ROOT / "mkdocs.yml").read_text("utf-8").partition("  - Guide:")[2].partition("\n  - Reference:")[0]
+    return [ROOT / "docs" / name for name in re.findall(r": ([\w-]+\.md)$", part, re.MULTILINE)]
+
+
+def test_the_navigation_has_four_parts() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:\n")[2]
+    assert re.findall(r"^  - (\w+):", navigation, re.MULTILINE) == ["Home", "Guide", "Reference", "Evidence", "Inside"]
+
+
+def test_the_guide_is_short() -> None:
+    lines = {page.name: len(page.read_text("utf-8").splitlines()) for page in guide()}
+    assert len(lines) >= 10
+    assert sum(lines.values()) <= 1500, f"move what is no guide to another part: {lines}"
+
+
+@pytest.mark.parametrize(
+    "page",
+    [ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs/reference").glob("*.md"))],
+    ids=lambda page: page.name,
+)
+def test_a_page_begins_with_what_its_reader_can_do_after_it(page: Path) -> None:
+    title, empty, first, *_ = page.read_text("utf-8").splitlines()
+    assert title.startswith("# ")
+    assert empty == ""
+    assert first.startswith("After this page you can ")
+
+
+def test_the_readme_fits_on_a_screen() -> None:
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 60
+
+
 @pytest.mark.skipif(not (ROOT / ".venv-docs/bin/mkdocs").exists(), reason="`make site` was never run here")
 def test_a_warning_is_an_error(tmp_path: Path) -> None:
     for name in ("docs", "CONTRIBUTING.md", "CHANGELOG.md", "mkdocs.yml", "README.md"):

@@ -1,4 +1,4 @@
-"""The README's result of a real sensor: its commands give its table, and the published values are within its U."""
+"""docs/real-sensors.md: its commands give its table, and the published values are within its U."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from tests.realdata.datasets import dataset
 from tests.realdata.test_mpu9150 import _expected
 from tests.scenarios.processes import ROOT
 
-README = (ROOT / "README.md").read_text("utf-8")
-TABLE = README.split("<!-- mpu9150: begin -->")[1].split("<!-- mpu9150: end -->")[0]
+PAGE = (ROOT / "docs/real-sensors.md").read_text("utf-8")
+TABLE = PAGE.split("<!-- mpu9150: begin -->")[1].split("<!-- mpu9150: end -->")[0]
 
 
 def numbers(text: str) -> list[str]:
@@ -28,7 +28,7 @@ def numbers(text: str) -> list[str]:
 
 def commands() -> tuple[str, list[str]]:
     """The line of awk, and the words of the command after it."""
-    awk, calibrate = re.findall(r"^    ((?:awk|fieldcal calibrate --sensor mpu9150).*)$", README, flags=re.MULTILINE)
+    awk, calibrate = re.findall(r"^    ((?:awk|fieldcal calibrate --sensor mpu9150).*)$", PAGE, flags=re.MULTILINE)
     return awk, shlex.split(calibrate)
 
 
@@ -57,6 +57,6 @@ def test_what_was_published_is_within_u() -> None:
     S, Q = _expected("imu0")
     assert (np.abs(values - np.column_stack([S, Q])) <= expanded + 1e-12).all()
     for told in ("1.00363, 1.00315 and 1.00647", "0.103, 0.097 and 0.344"):
-        assert told in " ".join(README.split())
+        assert told in " ".join(PAGE.split())
     np.testing.assert_allclose(np.diag(S), [1.00363, 1.00315, 1.00647], rtol=0, atol=1e-9)
     np.testing.assert_allclose(Q, [0.103, 0.097, 0.344], rtol=0, atol=1e-9)
