@@ -23,7 +23,6 @@ import copy
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 import numpy as np
 
@@ -34,7 +33,6 @@ from calib.site.day import Hours, day_of
 from calib.site.verdicts import Result, result
 from calib.site.watch import SiteWatch
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "site-watch.md"
 GATEWAYS = {8: 3, 30: 5, 200: 10}
 LEARNED_DAYS = 240
 CASES_OF_A_SITE = {8: 8, 30: 20, 200: 40}
@@ -342,6 +340,6 @@ if __name__ == "__main__":
             name, asked, text = f"site-watch {n}", f"--cases {given.cases}", table(n, given.cases, end)
         text = f"`python -m benchmarks.site_watch --sensors {n} {asked}`; {GATEWAYS[n]} gateways.\n\n{text}"
     if given.write:
-        write_part(name, text, PAGE)
+        write_part(name, text)
     else:
         print(text)
