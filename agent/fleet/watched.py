@@ -114,12 +114,13 @@ class Watched:
             made = line.calibration_run_id, line.calibration_sequence
             visited[i] |= calibration.setdefault(i, made) != made
             calibration[i] = made
-        return Hours(HOURS * number + np.arange(HOURS), power, cross, noise, degc), visited
+        return Hours(HOURS * number + np.arange(HOURS, dtype=float), power, cross, noise, degc), visited
 
 
 def watched(files: Sequence[Path]) -> Watched:
     """Check all lines of the files. Raises OSError, or WatchError where no line can be used."""
-    found, numbers, bands = Watched(files), {}, set[int]()
+    found, bands = Watched(files), set[int]()
+    numbers: dict[tuple[str, str], int] = {}
     for k, path in enumerate(files):
         with open_file(path) as file:
             offset, place = 0, 0

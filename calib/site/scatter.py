@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 
@@ -27,7 +28,7 @@ class Blocks:
         self.sums, self.days, self.squares, self.count = (np.zeros((len(lags), *shape)) for _ in range(4))
         self.past: dict[int, tuple[Array, Array]] = {}
 
-    def update(self, z: Array, there: Array) -> None:
+    def update(self, z: Array, there: NDArray[np.bool_]) -> None:
         """Take the residuals of a day; `there`: which of them count."""
         for k, lag in enumerate(self.lags):
             self.sums[k] += np.where(there, z, 0.0)
@@ -42,7 +43,7 @@ class Blocks:
         """(lags, ...): variance ratio of each lag, the median over sensors; 1 where nothing is known, never less."""
         some = self.count > 0
         each = np.where(some, self.squares / np.where(some, self.count, 1.0), np.nan)
-        known = some.any(axis=1)
+        known = some.sum(axis=1) > 0
         middle = np.ones(known.shape)
         for k in range(len(self.lags)):
             if known[k].any():
@@ -67,7 +68,7 @@ class Blocks:
             k = int(np.searchsorted(self.lags, today - begin + 1, side="right")) - 1
             squares, count = (part[k] for part in self.past[begin])
             told.append((squares + PRIOR_BLOCKS * middle[k]) / (count + PRIOR_BLOCKS))
-        return np.maximum(np.array(told), 1.0)
+        return np.asarray(np.maximum(np.array(told), 1.0))
 
     def snapshot(self) -> dict[str, Any]:
         """All state as plain arrays."""

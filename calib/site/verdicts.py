@@ -120,7 +120,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> Result:
     sensors = [NOTHING if d >= FEWEST_DAYS + FEWEST_SINCE else Told("learning") for d in days]
     gateways: dict[int, Told] = {}
     site, common, least = NOTHING, None, np.full((n, 3), np.inf)
-    tests = tested(watch)
+    tests = examined(watch)
     if tests is not None:
         noise = _noise(watch, limit)
         for i in range(n):
@@ -139,7 +139,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> Result:
     )
 
 
-def tested(watch: SiteWatch) -> Tests | None:
+def examined(watch: SiteWatch) -> Tests | None:
     """The joint test at all begins with enough days before and since; None where there is none."""
     begins, shape = watch.steps.begins, watch.shape
     which = [k for k, begin in enumerate(begins)

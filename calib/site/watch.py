@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.site.day import Day
@@ -71,7 +72,7 @@ class SiteWatch:
         self.steps.update(day.number, x, value.ravel(), weight.ravel())
         self.days_scatter.remember(self.steps.begins)
         self._noise(day)
-        self._seen(there.any(axis=(1, 2)))
+        self._seen(there.sum(axis=(1, 2)) > 0)
         mean = self.steps.beta[0].reshape(self.shape)
         self.G = design(np.where(self.steps.days.reshape(self.shape) > 0, mean, np.nan), np.nan_to_num(self.origin))
 
@@ -84,7 +85,7 @@ class SiteWatch:
         blocks = self.band_scatter
         enough = blocks.count[WEEK] + PRIOR_DEGREES
         week = (blocks.squares[WEEK] + PRIOR_DEGREES * blocks.inflation()[WEEK]) / enough
-        return own * np.maximum(week, 1.0)
+        return np.asarray(own * np.maximum(week, 1.0))
 
     def snapshot(self) -> dict[str, Any]:
         """All state as plain arrays, in dictionaries."""
@@ -149,7 +150,7 @@ class SiteWatch:
         self.noise.update(day.number, x, np.nan_to_num(value), weight)
         self.noise_scatter.remember(self.noise.begins)
 
-    def _seen(self, told: Array) -> None:
+    def _seen(self, told: NDArray[np.bool_]) -> None:
         if np.isfinite(self.degc):
             self.seen_degc[told, 0] = np.minimum(self.seen_degc[told, 0], self.degc)
             self.seen_degc[told, 1] = np.maximum(self.seen_degc[told, 1], self.degc)

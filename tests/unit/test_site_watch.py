@@ -13,7 +13,7 @@ from calib.site.day import Day, Hours, day_of
 from calib.site.scatter import Blocks
 from calib.site.steps import PRIOR, TERMS, Steps, inverted
 from calib.site.together import ALL, DIRECTIONS, design, jointly
-from calib.site.verdicts import Result, limit_of, result, tested
+from calib.site.verdicts import Result, examined, limit_of, result
 from calib.site.watch import SiteWatch
 
 BANDS_HZ = 10.0 ** (np.arange(0, 6) / 10.0)
@@ -235,7 +235,7 @@ def test_outside_the_temperatures_of_the_norm_u_grows(learned: tuple[Site, SiteW
         site, watch = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot())
         for _ in range(4):
             watch.update(replace(site.day(), temperature_degc=degc))
-        tests = tested(watch)
+        tests = examined(watch)
         assert tests is not None
         assert tests.begins[-2] == 20_060
         u.append(np.median(tests.joint.u[-2, :, :3]))
