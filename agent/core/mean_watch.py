@@ -44,7 +44,7 @@ class MeanWatch:
         before, now = self._first.mean(axis=0), self._newest.mean(axis=0)
         covariance: Array = np.cov(self._first[:, :3].T) * ALIKE * (1.0 / WEEK + 1.0 / DAY)
         covariance = covariance + between(law, before[3], now[3], before[:3])
-        found = mean_change(now[:3] - before[:3], covariance, before[:3])
+        found = mean_change(now[:3] - before[:3], covariance, before[:3], law.mean[:9].reshape(3, 3))
         return "" if found is None else found.told
 
     def snapshot(self) -> dict[str, Any]:

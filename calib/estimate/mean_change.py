@@ -4,7 +4,7 @@ The mean is gravity g through S and Q, divided by the calibration in force. With
 
 - Q of any axis changes: d is any vector;
 - the mount tilts by the small vector phi: d = phi x g, so that d is at right angles to g;
-- the sensitivity of output i changes by the share e: d = e g_i along axis i, where gravity has a part g_i.
+- the sensitivity of output i changes by the share e: d = e (S g)_i times column i of S^-1, which is about axis i.
 
 Nothing is seen of a sensitivity along an axis that is nearly level, of a turn about gravity, or of transverse
 sensitivities, and a mean alone never tells Q from the other two.
@@ -61,8 +61,9 @@ class MeanChange:
         return f"the mean has changed by {change} m/s² (U {U}): {which}{blind}"
 
 
-def mean_change(change: Array, covariance: Array, gravity_mps2: Array) -> MeanChange | None:
-    """What a change (3,) with its covariance (3, 3) may be, where the mean was `gravity_mps2` (3,) before.
+def mean_change(change: Array, covariance: Array, gravity_mps2: Array, sensitivity: Array) -> MeanChange | None:
+    """What a change (3,) with its covariance (3, 3) may be, where the mean was `gravity_mps2` (3,) before, by the
+    calibration in force with `sensitivity` (3, 3).
 
     None where gravity is not felt, or nothing is known of the scatter.
     """
@@ -82,8 +83,9 @@ def mean_change(change: Array, covariance: Array, gravity_mps2: Array) -> MeanCh
         tilt = size / g, float(np.sqrt(toward @ covered @ toward)) / g
     seen = np.abs(up) >= LEAST_PART
     shares = {}
+    by_output = np.asarray(np.linalg.inv(sensitivity) * (sensitivity @ gravity_mps2), dtype=np.float64)
     for i in np.flatnonzero(seen).tolist():
-        share, covered, rest = _fit(gravity_mps2[i] * np.eye(3)[:, i : i + 1], change, weight)
+        share, covered, rest = _fit(by_output[:, i : i + 1], change, weight)
         if rest <= chi2_quantile(1.0 - AGREES, 2.0):
             shares[AXES[i]] = float(share[0]), float(np.sqrt(covered[0, 0]))
     unseen = tuple(AXES[i] for i in np.flatnonzero(~seen).tolist())

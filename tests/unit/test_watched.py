@@ -321,7 +321,9 @@ def test_what_the_mean_was_at_the_calibration_is_known_after_a_restart() -> None
         for _ in range(round(days * 48)):
             made = world.block(1800.0)
             utc_ns = made.t_utc_ns + round((10.0 - days) * 86_400) * SECOND
-            site.step(replace(made, t_utc_ns=utc_ns, indications=made.indications * [1.0, 1.0, share]))
+            site.step(
+                replace(made, t_utc_ns=utc_ns, indications=(made.indications - Q_TRUE) * [1.0, 1.0, share] + Q_TRUE)
+            )
         sayings.append(hours(site.results)[-1].gravity)
         kept = {memory.identity: memory.state for memory in site.pipeline.all_memories()}
     assert sayings[0] == ""
