@@ -66,6 +66,9 @@ REVISIONS = (
     Revision(13, "d383a3c8cd5e", "0.2.0"),
     # The last before the noise that interpolation passes follows from where it interpolates.
     Revision(14, "ed64250afe1b", "0.2.0"),
+    # The last before held windows are explained by what an explanation gains beyond chance, and before transverse
+    # sensitivities of a reference.
+    Revision(15, "d84dd71c851d", "0.2.0"),
 )
 
 
