@@ -75,7 +75,7 @@ def _order(files: Watched, found: Result, beside_reference: Sequence[int]) -> li
     return sorted(gain, key=lambda one: -one[1])
 
 
-def rows(what: Seen) -> list[tuple[str, ...]]:
+def rows(what: Seen) -> list[tuple[str, str, str, str, str]]:
     """The table: sensor, verdict, size with U, since, what to do. First what has changed, in the order of visits."""
     found, places = what.found, {i: k for k, (i, _) in enumerate(what.order)}
     table = [("site", *_cells(found.site))] if found.site.kind != "none" else []

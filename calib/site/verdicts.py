@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.distributions import NORMAL, student_quantile
 from calib.model import Array
@@ -23,9 +24,8 @@ FEWEST_DAYS = 21  # that teach the norm of a sensor
 FEWEST_SINCE = 3  # days after a step, before it is told
 WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk after a day: 0.06 % in a year
 COVERAGE = 2.0
-MISFIT = (
-    1.15  # factor of u for what the norm does not fit over seasons; from the sound sites of benchmarks/site_watch.py
-)
+# Factor of u for what the norm does not fit over seasons; from the sound sites of benchmarks/site_watch.py.
+MISFIT = 1.15
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 FEWEST_BANDS = 3  # for bands to be called alike
 NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
@@ -77,7 +77,7 @@ class Result:
     least_detectable: Array
     days: Array
     seen_degc: Array
-    outside: Array
+    outside: NDArray[np.bool_]
     common: Told | None
     hidden: float
     limit: float
@@ -86,22 +86,21 @@ class Result:
 @dataclass(frozen=True, slots=True, eq=False)
 class Tests:
     """The joint test at each begin of a step (k,). `apart` (k, n): do the bands of a sensor change differently, as a
-    normal deviate; `site` (k,): mean square of all steps over their variance; `bands` (k, n): that tell of a sensor."""
+    normal deviate; `bands` (k, n): that tell of a sensor."""
 
     begins: list[int]
     joint: Joint
     apart: Array
-    site: Array
     bands: Array
 
-    def dated(self, squared: Array) -> tuple[int, int, int, int]:
-        """Index of the likeliest begin, with its day, and the first and last day that are not told apart from it."""
+    def dated(self, squared: Array) -> tuple[int, tuple[int, int, int]]:
+        """Index of the likeliest begin; its day, and the first and last day that are not told apart from it."""
         best = int(np.argmax(squared))
         near = np.flatnonzero(squared >= squared[best] - EVIDENCE_DROP)
         first, last = int(near[0]), int(near[-1])  # between these and the next begins none is kept
         earliest = self.begins[first - 1] + 1 if first else self.begins[0]
         latest = self.begins[last + 1] - 1 if last + 1 < len(self.begins) else self.begins[last]
-        return best, self.begins[best], earliest, latest
+        return best, (self.begins[best], earliest, latest)
 
 
 def limit_of(sensors: int, gateways: int, per_year: float = FALSE_ALARMS_PER_YEAR) -> float:
@@ -155,9 +154,9 @@ def examined(watch: SiteWatch) -> Tests | None:
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
     inflation = MISFIT**2 * watch.days_scatter.over(watch.day, [begins[k] for k in which])
     joint = jointly(size, information, watch.G, inflation, walk)
-    apart, site = _apart(joint, watch.G)
+    apart = _apart(joint, watch.G)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
-    return Tests([begins[k] for k in which], joint, apart, site, bands)
+    return Tests([begins[k] for k in which], joint, apart, bands)
 
 
 def _without(variance: Array, size: Array, information: Array, days: Array) -> Array:
@@ -166,8 +165,11 @@ def _without(variance: Array, size: Array, information: Array, days: Array) -> A
     return np.asarray(np.maximum(variance - size**2 * information / freedom, LEAST_VARIANCE * variance))
 
 
-def _apart(joint: Joint, G: Array) -> tuple[Array, Array]:
-    """How much the bands of each sensor differ from any change of its sensitivities and any turn."""
+def _apart(joint: Joint, G: Array) -> Array:
+    """How much the bands of each sensor differ from any change of its sensitivities and any turn, (k, n).
+
+    What most sensors show, such as days that the norm does not fit, is taken as scatter.
+    """
     n, channels = len(G), G.shape[1] * G.shape[2]
     g = G.reshape(n, channels, -1)
     r, info = joint.rest.reshape(-1, n, channels), joint.information.reshape(-1, n, channels)
@@ -183,17 +185,17 @@ def _apart(joint: Joint, G: Array) -> tuple[Array, Array]:
     site = median(np.where(freedom > 0, squares / f, np.nan), axis=1)
     ratio = squares / f / (MISFIT * np.maximum(site, 1.0))[:, None]
     deviate = (np.cbrt(ratio) - (1.0 - 2.0 / (9.0 * f))) / np.sqrt(2.0 / (9.0 * f))
-    return np.where(freedom > 0, deviate, -np.inf), site
+    return np.asarray(np.where(freedom > 0, deviate, -np.inf))
 
 
 def _sensor(tests: Tests, i: int, limit: float, noise: Told) -> Told:
     """The verdict of one sensor by itself."""
     statistic, apart = tests.joint.statistic[:, i], tests.apart[:, i]
     direction = int(np.argmax(np.abs(statistic).max(axis=0)))
-    best, *dates = tests.dated(statistic[:, direction] ** 2)
+    best, dates = tests.dated(statistic[:, direction] ** 2)
     z = abs(float(statistic[best, direction]))
     if apart.max() > limit and (z <= limit or apart[best] > limit):
-        worst, *dates = tests.dated(np.maximum(apart, 0.0) ** 2)
+        worst, dates = tests.dated(np.maximum(apart, 0.0) ** 2)
         return Told("sensor or structure", "its bands change differently", 0.0, np.inf, *dates, float(apart[worst]))
     if z > limit:
         kind = "sensitivity" if direction <= ALL else "turn"
@@ -237,7 +239,7 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[Told], limit: float)
     what = "the two gateways differ; which of them changed is not seen" if pair else "all its sensors alike"
     for g, number in enumerate(numbers.tolist()[: 1 if pair else None]):
         own = index == g
-        best, *dates = tests.dated(np.square(mean[:, g] / u[:, g]))
+        best, dates = tests.dated(np.square(mean[:, g] / u[:, g]))
         z = abs(float(mean[best, g] / u[best, g]))
         alone = np.abs(tests.joint.statistic[best, own, SENSITIVITIES]).max()
         if z > max(limit, alone) and fits[best, g] and own.sum() > 1:
@@ -248,7 +250,7 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[Told], limit: float)
     return told
 
 
-def _means(joint: Joint, index: Array) -> tuple[Array, Array, Array]:
+def _means(joint: Joint, index: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """Mean change of the sensors of each gateway against the median of the gateways (k, g), its u, and whether its
     sensors agree. Of two gateways: their difference."""
     s, weight = joint.size[:, :, ALL], 1.0 / np.square(joint.u[:, :, ALL])
@@ -270,7 +272,7 @@ def _structure(tests: Tests, sensors: list[Told]) -> Told:
     own = [i for i, told in enumerate(sensors) if told.kind == "sensor or structure"]
     if len(own) >= 2:
         apart = np.maximum(tests.apart[:, own].max(axis=1), 0.0)
-        best, *dates = tests.dated(apart**2)
+        best, dates = tests.dated(apart**2)
         z = float(apart[best])
         for i, told in enumerate(sensors):  # what is weaker than the damage may follow from it
             if told.kind in ("sensitivity", "turn") and told.statistic < z:
@@ -290,7 +292,7 @@ def _common_change(tests: Tests, known_u: Array, anchored: Array) -> Told:
     some = total > 0.0
     total = np.where(some, total, 1.0)
     mean, u_mean = -np.sum(weight * s, axis=1) / total, np.where(some, 1.0 / np.sqrt(total), np.inf)
-    best, *dates = tests.dated(np.square(mean / u_mean))
+    best, dates = tests.dated(np.square(mean / u_mean))
     z = abs(float(mean[best] / u_mean[best]))
     return Told(
         "common", "all sensors without a reference", float(mean[best]), COVERAGE * float(u_mean[best]), *dates, z
