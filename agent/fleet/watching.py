@@ -84,7 +84,8 @@ def rows(what: Seen) -> list[tuple[str, str, str, str, str]]:
     by_visit = sorted(
         range(len(found.sensors)), key=lambda i: (found.sensors[i].kind in quiet, places.get(i, len(places)))
     )
-    return table + [("/".join(what.watched.sensors[i]), *_cells(found.sensors[i])) for i in by_visit]
+    table += [("/".join(what.watched.sensors[i]), *_cells(found.sensors[i])) for i in by_visit]
+    return table
 
 
 def _cells(told: Told) -> tuple[str, str, str, str]:
