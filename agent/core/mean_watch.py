@@ -13,7 +13,7 @@ from calib.estimate.mean_change import mean_change
 from calib.model import Array
 
 WEEK, DAY = 168, 24  # hours: in the first ones the mean is learnt; the mean of the newest ones is compared with it
-ALIKE = 6  # neighbouring hours count as one: temperature, wind and load last for hours
+ALIKE = 24  # neighbouring hours count as one: temperature, wind and load last for up to a day
 MINUTES = 30  # used in an hour, for its mean to count
 
 
