@@ -127,7 +127,7 @@ def test_a_certificate_is_overdue_after_its_interval_and_not_before() -> None:
 
 def test_a_recording_of_the_version_before_keeps_its_drift_of_the_reference() -> None:
     text = site_config().model_dump_json()
-    before = text.replace('"calibrated":""', '"calibrated":"in May"').replace(
+    before = text.replace('"calibrated":"","interval', '"calibrated":"in May","interval').replace(
         '"process":{', '"process":{"reference_pct":0.01,'
     )
     assert before.count("reference_pct") == before.count("in May") == 1
