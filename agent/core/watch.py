@@ -97,10 +97,6 @@ class Watch:
             return None
         return self._close(law)
 
-    def forget(self) -> None:
-        """Another device has this name now."""
-        self.__init__()  # type: ignore[misc]
-
     def _turn_hour(self, t_utc_ns: int, law: Law) -> Hour | None:
         hour, done = t_utc_ns // HOUR_NS, None
         if self._hour is not None and (hour > self._hour or t_utc_ns < self._hour * HOUR_NS - BACK_NS):

@@ -18,8 +18,8 @@ DAY_NS = round(DAY_S * 1e9)
 MAIN = [0, 4, 8]  # places of the main sensitivities among the parameters
 WATCHED = "no reference: watched"
 NOT_CALIBRATED = (
-    "no reference: watched, with no calibration in force; state that of a bench or a visit in prior.file, and its date "
-    "in prior.calibrated"
+    f"{WATCHED}, with no calibration in force; state that of a bench or a visit in prior.file, and its date in "
+    "prior.calibrated"
 )
 SINCE = "walks since the calibration"  # a line of the budget
 

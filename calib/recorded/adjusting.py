@@ -136,13 +136,14 @@ def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN
     response by `most_between`.
 
     Where all motion has one frequency, each window of it fits several lags, each with another S. Where windows then
-    differ from each other, the search may have led to a lag that not all of them fit, and begins anew at others.
+    differ from each other, the search may have led to a lag that not all of them fit, and begins anew at others. What
+    is refused stays so: half a period later, a tone of the other sign fits as well.
     """
     told = _searched(tables, priors, most_between, priors.lag_at_s)
     found = told.found
-    if found is None or found.response is None or not found.grounds.priors.response_model.one_frequency:
+    if told.outcome.reasons or found is None or found.response is None:
         return told
-    if _between_windows(told) > ALIKE:
+    if found.grounds.priors.response_model.one_frequency and _between_windows(told) > ALIKE:
         period_s, lag_s = 1.0 / found.response.reference_frequency_hz, found.lag_s or 0.0
         others = [_searched(tables, priors, most_between, lag_s + share * period_s) for share in OTHER_LAGS]
         told = min((told, *others), key=lambda each: (bool(each.outcome.reasons), _between_windows(each)))

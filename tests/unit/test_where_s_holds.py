@@ -10,6 +10,7 @@ import pytest
 
 from calib import calibrate
 from calib.estimate.nuisances import Priors
+from calib.geometry import clamp
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
 from calib.signal.known_response import UNKNOWN, KnownResponse, known_of
@@ -87,10 +88,30 @@ def test_one_tone_in_all_stays_tells_s_at_its_frequency(response: Filter, shaken
 
 
 def test_windows_of_one_frequency_without_a_common_lag_are_refused() -> None:
-    """Far above the corner a tone leaves little to tell its lag from: S was 27 u off, and valid."""
-    found, _ = turned_by_hand(lowpass(3, 7.3), 0.11, 1)
+    """A steep filter near the tone: no S fits the sizes of all windows."""
+    found, _ = turned_by_hand(lowpass(4, 12.0), 0.1, 1)
     assert found.status == "refused"
     assert "have no S and no lag in common" in found.reasons[0]
+
+
+def test_a_reversed_reference_is_no_lag_of_half_a_period() -> None:
+    """Half a period later, a tone of the other sign fits as well: what is refused for its sign stays refused."""
+    random = np.random.default_rng(16)
+    t, values, motion, poses = np.arange(2000) / RATE_HZ, [], [], []
+    for k, alpha_deg in enumerate((0.0, 30.0, 90.0, 150.0, 180.0, 240.0, 270.0, 330.0)):
+        pose = clamp(np.deg2rad(40.2), np.deg2rad(alpha_deg + 0.2 * random.normal()))
+        a = 3.83 * np.sin(2.0 * np.pi * 4.4 * t + random.uniform(0.0, 6.28)) * np.hanning(len(t)) ** 0.15
+        lines = np.fft.rfft(np.concatenate([a, a[::-1]])) * lowpass(1, 10.2)(np.fft.rfftfreq(2 * len(a), 1.0 / RATE_HZ))
+        felt = np.fft.irfft(lines)[: len(a)]
+        values.append(np.outer(felt, pose.direction) + pose.gravity_mps2 + 0.1)
+        motion.append(-a)
+        poses.append({"start_s": 20.0 * k + 0.5, "stop_s": 20.0 * k + 19.5, "theta_deg": 40.0, "alpha_deg": alpha_deg})
+    V, u = np.concatenate(values), np.concatenate(motion)
+    V, u = V + 0.005 * random.normal(size=V.shape), u + 0.001 * random.normal(size=u.shape)
+    t = np.arange(len(u)) / RATE_HZ
+    found = calibrate((t, V), {"time_s": t, "a": u}, poses=poses)
+    assert found.status == "refused"
+    assert "polarity of the reference reversed" in found.reasons[0]
 
 
 def test_two_tones_tell_s_at_their_mean_frequency_by_power() -> None:
