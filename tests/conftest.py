@@ -18,6 +18,7 @@ from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
 from agent.engine import identity
+from tests.quick import Quick
 
 if TYPE_CHECKING:
     from xdist.remote import Producer
@@ -54,9 +55,16 @@ class ScenariosBesideTheRest(LoadScopeScheduling):
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if "not slow" in config.getoption("markexpr"):
+        config.pluginmanager.register(Quick())
+    if not hasattr(config, "workerinput"):
+        write_engine_id()
+
+
+def write_engine_id() -> None:
     """The id of the engine stands in a file, as in a wheel: each program that a test starts would compute it, for a
     second of processor time. The file does not count any more as soon as a source is another one."""
-    if hasattr(config, "workerinput") or identity.built()[0]:
+    if identity.built()[0]:
         return
     path = Path(identity.__file__).with_name(identity.BUILT)
     written = path.with_suffix(f".{os.getpid()}")

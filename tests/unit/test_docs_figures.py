@@ -11,7 +11,6 @@ from __future__ import annotations
 import ast
 import importlib.util
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -44,6 +43,7 @@ ELSEWHERE = {
 }  # fmt: skip
 
 
+@cache
 def parts() -> dict[str, str]:
     """All parts between markers, by name."""
     return {name: text for page in PAGES for name, text in PART.findall(page.read_text("utf-8"))}
@@ -67,8 +67,10 @@ def written(module: str) -> set[str]:
     }  # fmt: skip
 
 
-def cells(module: str) -> Iterator[re.Pattern[str]]:
+@cache
+def cells(module: str) -> list[re.Pattern[str]]:
     """What each cell of a table may be that this module writes: its texts, with anything where a value is put in."""
+    found = []
     for node in ast.walk(ast.parse(source(module))):
         pieces = node.values if isinstance(node, ast.JoinedStr) else [node] if isinstance(node, ast.Constant) else []
         text = "".join(
@@ -77,9 +79,11 @@ def cells(module: str) -> Iterator[re.Pattern[str]]:
         for cell in re.split(r"\\\||\\\n", text):
             pattern = cell.replace(r"\ ", " ").strip()
             if pattern.replace(".+", "").strip():  # a cell that is nothing but a value tells nothing
-                yield re.compile(pattern)
+                found.append(re.compile(pattern))
+    return found
 
 
+@cache
 def writers() -> dict[str, str]:
     """The module that writes each part."""
     modules = [f"benchmarks.{path.stem}" for path in (ROOT / "benchmarks").glob("*.py") if path.stem != "__main__"]
