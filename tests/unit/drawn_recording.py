@@ -58,12 +58,14 @@ class Motion:
         self._line = devices.level_mps2 * (drawn[0] + 1j * drawn[1]) / np.sqrt(devices.lines)
 
     def at(self, t: np.ndarray, *, derivatives: int = 0, corner_hz: float = 0.0) -> np.ndarray:
-        """(n, axes) of what is differentiated so often to give the acceleration, after a filter of this corner."""
+        """(n, axes) of what is differentiated so often to give the acceleration, after a filter of this corner, at
+        equidistant times: exp(i w (t + s)) = exp(i w t) exp(i w s) takes far fewer exponentials than times."""
         passed = 1j * self._hz / (corner_hz + 1j * self._hz)
         lines = self._line * passed / (2j * np.pi * self._hz) ** derivatives
-        return np.column_stack(
-            [(np.exp(2j * np.pi * np.outer(t, hz)) @ line).real for hz, line in zip(self._hz, lines, strict=True)]
-        )
+        size = round(np.sqrt(len(t)))
+        turned, within = (np.exp(2j * np.pi * self._hz[..., None] * s) for s in (t[::size], t[:size] - t[0]))
+        found = (lines[..., None] * turned).mT @ within
+        return np.asarray(found.real.reshape(len(lines), -1).T[: len(t)])
 
 
 class Recording:
