@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -77,11 +78,22 @@ def takes_scenarios(node: WorkerController) -> bool:
     return int(node.gateway.id.removeprefix("gw")) % 2 == 0
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with a slow test come first: as one of the last they would keep one process busy while the others have
-    ended."""
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    """Of a test marked `one_case`, all cases but the first are thorough.
+
+    Files with many slow tests come first: as one of the last they would keep one process busy while others have ended.
+    """
+    seen = set[str]()
+    for item in items:
+        if item.get_closest_marker("one_case"):
+            item.add_marker("slow")
+            name = item.nodeid.partition("[")[0]
+            if name in seen:
+                item.add_marker("thorough")
+            seen.add(name)
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling | None:

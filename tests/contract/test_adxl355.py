@@ -120,6 +120,7 @@ class TestAdxl355(I2cContract):
         rig.put(Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, identity=rig.twin_class.own_identity))
         rig.sensor.open()
 
+    @pytest.mark.slow
     @on_one_adapter
     def test_a_temperature_that_changes_while_it_is_read_is_not_torn(self, rig: Adxl355Rig) -> None:
         # 0x6FF and 0x700 in turn, every 1.7 ms: of 300 single readings, some have the high byte of one and the low byte
@@ -329,6 +330,7 @@ def shaken_blocks(rate_hz: float, starts_s: NDArray[np.float64], seconds: float)
     return first[0], blocks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [4000.0, 1000.0, 500.0])
 def test_what_the_stop_of_the_drive_spoils_is_marked_saturated(rate_hz: float) -> None:
     # Over range the output drops to zero before the filters, which spread the drop. Each knock is near a joint of two

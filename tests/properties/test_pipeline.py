@@ -19,7 +19,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @pytest.mark.slow
-@settings(max_examples=4)
+@settings(max_examples=1)
 @given(seed=seeds, reference=st.booleans())
 @example(seed=9, reference=True)  # five calibrations each, which few seeds have
 @example(seed=35, reference=True)

@@ -88,6 +88,7 @@ def test_an_offset_that_scatters_more_than_stated_counts_as_it_scatters():
     assert np.sqrt(np.mean(np.square(seen))) == pytest.approx(0.3, rel=0.25)
 
 
+@pytest.mark.slow
 def test_coloured_residuals_are_not_taken_for_white():
     """AR(1) 0.99, 40 recordings: each Q within its own u as often as it should (chi-squared over 120 values)."""
     white, pulls = [], []

@@ -82,6 +82,7 @@ def test_truth_lies_within_the_expanded_uncertainty(session):
     assert np.sqrt(squares) == pytest.approx(told["standard_uncertainty"]["sensitivity"][0][0], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_turned_static_sign_is_refused_with_status_3(session):
     result = _run(session, "--nominal", "1", "--u-nominal-pct", "20", "--static-sign", "-1", "--json", "-")
     told = _told(result)
@@ -97,6 +98,7 @@ def test_a_contradicted_nominal_is_refused_with_numbers(session):
     assert "2 with u 0.1 was expected" in _told(result)["reasons"][0]
 
 
+@pytest.mark.slow
 def test_an_earlier_result_serves_as_prior_and_may_be_contradicted(session, tmp_path):
     first = _told(_run(session, *STATED, "--json", "-"))
     covariance = np.array(first["covariance"]) + np.diag([4e-4] * 9 + [0.1] * 3)  # known to 2 % beforehand

@@ -8,6 +8,7 @@ is the uncertainty, and must be the one that the adjustment states from a single
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy import optimize
 
 from calib.estimate.adjustment import adjust
@@ -36,6 +37,7 @@ def _points(x: np.ndarray) -> np.ndarray:
     return np.concatenate(out)
 
 
+@pytest.mark.slow
 def test_the_stated_covariance_is_that_of_trials():
     random = np.random.default_rng(20)
     session = clamp_points(random, Faults(noise_mps2=NOISE), repetitions=REPETITIONS, rate_hz=RATE_HZ, cycles=CYCLES)

@@ -39,6 +39,7 @@ def _windows(random: np.random.Generator) -> list[Window]:
     return windows
 
 
+@pytest.mark.slow
 def test_the_attenuation_is_taken_out_and_u_says_what_is_left():
     errors, lost, pulls = [], [], []
     for seed in range(20):
@@ -72,6 +73,7 @@ def test_a_direction_with_no_more_than_the_reference_s_noise_is_not_excited(seed
     np.testing.assert_allclose(found.calibration.sensitivity[:, 0], S_TRUE[:, 0], rtol=0, atol=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_mps2", [1e-5, 1e-7, 0.0])
 def test_data_of_hardly_any_noise_leave_what_the_priors_leave(noise_mps2: float) -> None:
     """Offsets and angles make u; type A at 0.001 m/s2 is a hundredth of it. Simulated data come without noise."""

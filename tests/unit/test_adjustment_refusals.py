@@ -52,6 +52,7 @@ def test_one_alpha_is_refused_with_the_rank():
     assert "rank 2 of 4" in _only_reason(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("priors", [Priors(), Priors.none(), _nominal()])
 def test_z_outward_with_the_printed_signs_names_the_sign(priors):
     windows = _turned(clamp_points(np.random.default_rng(3), ORDINARY).windows, static=-1.0)
@@ -68,6 +69,7 @@ def test_both_turned_are_named_where_the_sensor_is_known():
     assert "the static sign and the polarity" in _only_reason(adjust(windows, _nominal()))
 
 
+@pytest.mark.slow
 def test_right_signs_are_not_refused():
     """Fifty ordinary recordings with fixed seeds: at one false alarm in a thousand, 95 % of such sets have none."""
     refused = [
@@ -77,6 +79,7 @@ def test_right_signs_are_not_refused():
     assert refused == [()] * 50
 
 
+@pytest.mark.slow
 def test_swapped_axes_contradict_the_nominal():
     windows = clamp_points(np.random.default_rng(7), ORDINARY, S=S_TRUE[[1, 0, 2]]).windows
     assert "Sxx is 0.01" in _only_reason(adjust(windows, _nominal())) or "expected" in _only_reason(
@@ -129,6 +132,7 @@ def test_planar_motion_at_two_frequencies_parts_lag_and_rotation():
     assert np.isnan(found.calibration.sensitivity[:, 2]).all()
 
 
+@pytest.mark.slow
 def test_a_misfit_of_the_size_of_the_signal_is_refused():
     """A sensor that was turned by 40 deg on the clamp in one of five positions: no S a + Q explains that."""
     faults = Faults(alpha_rad={300.0: 40.0 * DEGREE}, offset_mps2=0.05)
@@ -155,6 +159,7 @@ def _reference_times(windows: list[Window], factor: float) -> list[Window]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [2.0, 0.8, 1.2])
 def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(factor):
     windows = _reference_times(clamp_points(np.random.default_rng(20), ORDINARY).windows, factor)
@@ -164,6 +169,7 @@ def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(facto
     assert not adjust(windows, replace(Priors(), reference=0.5)).reasons
 
 
+@pytest.mark.slow
 def test_nuisances_drawn_from_their_priors_pull_as_such():
     """Pull over its limit in 60 sound recordings: a twice too small spread would bring one above 1."""
     pulls = []

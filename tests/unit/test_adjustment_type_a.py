@@ -29,6 +29,7 @@ def _rests(random: np.random.Generator, windows: int, phi: float) -> tuple[list[
     return out, means.var(axis=0) * n / 0.02**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phi", [0.0, 0.8, 0.9])
 def test_the_scatter_of_means_is_the_one_that_400_windows_show(phi):
     """phi 0.9: a correlation time of 10 samples in segments of 20; without their neighbours it is a third too small."""

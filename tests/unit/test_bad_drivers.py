@@ -162,6 +162,7 @@ def test_a_bug_costs_what_it_breaks_and_nothing_else(runs: dict[str, Run], bug: 
     assert [block.first_index for block in whole] == [10 * k for k in range(len(whole))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bug", [*IN_BLOCKS, *NOT_FIRST])
 def test_a_bad_block_is_a_drop_with_its_reason(runs: dict[str, Run], bug: str) -> None:
     gaps = [event for event in runs[bug].of(name_of(bug)) if isinstance(event, Gap)]
@@ -183,6 +184,7 @@ def losses(found: Run, bug: str) -> list[str]:
     return [e.message for e in found.of(name_of(bug)) if isinstance(e, DeviceChange) and e.state == "lost"]
 
 
+@pytest.mark.slow
 def test_ten_faults_in_a_row_name_the_driver_and_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -206,6 +208,7 @@ def test_ten_faults_in_a_row_name_the_driver_and_what_to_do(
 HANGS = ["open", "read_block", "close"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", HANGS)
 def test_a_driver_that_does_not_return_is_named_and_the_agent_ends_in_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
@@ -225,6 +228,7 @@ def test_a_driver_that_does_not_return_is_named_and_the_agent_ends_in_time(
     assert f"Buggy: it has not returned from {method} for 0.5 s" in losses(found, bug)[-1]
 
 
+@pytest.mark.slow
 def test_a_driver_that_returns_late_is_opened_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "HANGS_S", 0.5)
     bug = "read_block: returns after two seconds"
@@ -235,6 +239,7 @@ def test_a_driver_that_returns_late_is_opened_again(tmp_path: Path, monkeypatch:
     assert found.audit == 0
 
 
+@pytest.mark.slow
 def test_arrays_that_the_driver_uses_again_are_recorded_as_they_were(tmp_path: Path) -> None:
     bug = "one array for all blocks"
     found = run(one(bug), tmp_path, lambda found: len(found.of(name_of(bug))) > 6)
@@ -243,6 +248,7 @@ def test_arrays_that_the_driver_uses_again_are_recorded_as_they_were(tmp_path: P
     assert found.audit == 0
 
 
+@pytest.mark.slow
 def test_a_flood_of_blocks_takes_nothing_from_another_device(tmp_path: Path) -> None:
     bug = "a flood"
     found = run(one(bug), tmp_path, lambda found: sum(isinstance(e, SampleBlock) for e in found.of("good")) > 20)
@@ -291,6 +297,7 @@ def test_doctor_names_a_driver_with_a_bug(
     assert "samples a second" in found[1]["says"]
 
 
+@pytest.mark.slow
 def test_a_driver_that_cannot_be_made_is_a_fault_of_the_configuration(tmp_path: Path) -> None:
     done = fieldcal("run", written(tmp_path, "it cannot be made"), "--data-dir", tmp_path / "data")
     assert done.returncode == 2

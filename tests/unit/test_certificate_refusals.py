@@ -34,6 +34,7 @@ def test_what_is_no_certificate_is_refused(text: str, words: str, tmp_path: Path
             read_earlier(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("section", "lines", "words"),
     [

@@ -36,6 +36,7 @@ def told(path: Path) -> object:
     return json.loads((path / "certificate.json").read_text())["certificate"]
 
 
+@pytest.mark.slow
 def test_options_state_what_a_file_states(capsys: pytest.CaptureFixture[str], tmp_path: Path, result: Path) -> None:
     stated = [word for name, value in entries().items() for word in ("--state", f"{name}={value}")]
     assert run(capsys, result, *stated, "-o", tmp_path / "options") == (0, "")
@@ -47,6 +48,7 @@ def test_options_state_what_a_file_states(capsys: pytest.CaptureFixture[str], tm
     assert told(tmp_path / "again") == told(tmp_path / "file")
 
 
+@pytest.mark.slow
 def test_an_option_replaces_what_the_file_states(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, result: Path
 ) -> None:
@@ -57,6 +59,7 @@ def test_an_option_replaces_what_the_file_states(
     assert "Bridge Operator" not in text
 
 
+@pytest.mark.slow
 def test_the_file_of_the_statements_is_not_written_over(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, result: Path
 ) -> None:
@@ -99,12 +102,14 @@ def test_a_wrong_entry_is_one_line(
     assert (status, said.count("\n"), words in said) == (2, 1, True), said
 
 
+@pytest.mark.slow
 def test_questions_are_asked_on_a_terminal(tmp_path: Path, result: Path) -> None:
     stated = [f"--state={name}={value}" for name, value in entries().items() if not name.startswith("customer")]
     answered("certificate", result, *stated, "-o", tmp_path / "out", typed="Tower Operator\nPescara\nIT\n")
     assert tomllib.loads((tmp_path / "out" / "certificate.toml").read_text())["customer"]["name"] == "Tower Operator"
 
 
+@pytest.mark.slow
 def test_a_led_session_ends_with_the_certificate(tmp_path: Path) -> None:
     assert run_cli(["simulate", "--preset", "plain", "--csv", str(tmp_path)]) == 0
     options = parsed([f"--{name}={tmp_path / name}.csv" for name in ("sensor", "reference", "poses")])

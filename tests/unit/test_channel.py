@@ -105,6 +105,7 @@ def test_windows_held_for_a_wrong_reference_go_with_it() -> None:
     assert [w.used for w in windows(site.play(3))][-2:] == [True, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["rs", "sr"])
 def test_another_reference_after_a_restart_is_not_taken_for_the_one_before(order: str) -> None:
     site = begun(site_config())
@@ -203,6 +204,7 @@ def test_a_new_prior_that_the_calibration_in_force_contradicts_is_an_operators_w
     assert reason.startswith("begun again from the prior: the calibration in force contradicts the changed prior: ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "status", "reason"),
     [

@@ -105,6 +105,7 @@ def test_each_reference_has_its_own_unknowns_and_priors() -> None:
     assert 0.998 * with_both < 100 * found.in_force.standard_uncertainty[SYY] / S_TRUE[1, 1] < with_first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("which", "device", "other"), [("first", "r", "c"), ("second", "c", "r")])
 def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, device: str, other: str) -> None:
     found, control = sound(estimation()), sound(estimation())
@@ -122,11 +123,13 @@ def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, d
     assert abs(found.in_force.sensitivity[1, 1] - before.sensitivity[1, 1]) < 0.5 * u[SYY]
 
 
+@pytest.mark.slow
 def test_a_reference_that_is_stated_not_to_drift_is_named_too() -> None:
     results = judged(sound(estimation(stability_pct=0.0)), 101, 12, 24, STEPPED["first"])
     assert "the reference r has changed by y +" in adopted(results)
 
 
+@pytest.mark.slow
 def test_if_both_see_the_step_it_is_the_sensor_and_u_does_not_grow() -> None:
     found, control = sound(estimation()), sound(estimation())
     judged(control, 102, 12, 12)
@@ -139,6 +142,7 @@ def test_if_both_see_the_step_it_is_the_sensor_and_u_does_not_grow() -> None:
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1] * (1 + STEP)) < 3 * u[SYY]
 
 
+@pytest.mark.slow
 def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() -> None:
     found = sound(estimation())
     before = found.in_force
@@ -151,6 +155,7 @@ def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() 
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1]) < 3 * u
 
 
+@pytest.mark.slow
 def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
     found = sound(estimation())
     assert actions(judged(found, 105, 12, 3, STEPPED["first"], turns=(FIRST,) * 3)) == ["hold"] * 3
@@ -162,6 +167,7 @@ def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
     assert "no window with c tells" in reason
 
 
+@pytest.mark.slow
 def test_sound_windows_of_the_other_reference_do_not_dismiss_held_ones() -> None:
     found = sound(estimation())
     turns = (FIRST, FIRST, SECOND, SECOND, SECOND, SECOND, FIRST, FIRST, FIRST)
@@ -170,10 +176,12 @@ def test_sound_windows_of_the_other_reference_do_not_dismiss_held_ones() -> None
     assert "the reference r has changed by y +" in adopted(results)
 
 
+@pytest.mark.slow
 def test_nothing_is_named_while_nothing_changes() -> None:
     assert set(actions(judged(estimation(), 108, 0, 32))) == {"take"}
 
 
+@pytest.mark.slow
 def test_a_state_goes_on_bit_for_bit_while_windows_are_held() -> None:
     found = sound(estimation())
     judged(found, 101, 12, 7, STEPPED["first"])
@@ -207,6 +215,7 @@ def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
         assert found.state.quantity(f"rotation_x of place {place}")[1] >= np.deg2rad(0.2)
 
 
+@pytest.mark.slow
 def test_a_second_reference_can_be_removed_and_added_again() -> None:
     found = sound(estimation())
     both, alone = configured(), configured(both=False)

@@ -62,6 +62,7 @@ def both(duration_s: float, seed: int = 1) -> list[Event]:
     )
 
 
+@pytest.mark.slow
 def test_rate_lateness_and_scatter_are_those_of_the_simulated_devices() -> None:
     """Eight runs of a minute, seeds 0 to 7: a sensor 1.3 % off what its driver states, a reference 0.01 % off."""
     rates_hz, scale_s = {"s": 101.3, "r": 199.98}, 4e-4
@@ -127,6 +128,7 @@ def test_a_device_in_place_of_another_is_not_reported_by_the_clock_before() -> N
     assert [r.device for r in clocks(found, list(swapped))] == ["s"]
 
 
+@pytest.mark.slow
 def test_the_same_events_give_the_same_reports_also_from_a_snapshot() -> None:
     events = both(125.0)
     once = pipeline(reference=True, rate_hz=100.0)

@@ -29,6 +29,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["certificate.xml", "certificate.json", "result.json"])
 def test_the_prior_is_what_the_file_states_and_a_recording_carries_it(made: Path, tmp_path: Path, name: str) -> None:
     file = tmp_path / name

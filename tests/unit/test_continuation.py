@@ -54,6 +54,7 @@ def test_the_store_keeps_the_states_of_a_sensor_that_is_not_configured(tmp_path:
     again.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["stop", "kill"])
 def test_of_more_devices_than_are_kept_recording_and_store_keep_the_same(tmp_path: Path, end: str) -> None:
     run = Run(tmp_path)

@@ -39,6 +39,7 @@ def errors(recording: Recording, **sections: Any) -> np.ndarray:
     return recording.errors_over_u(found.sensitivity, found.covariance, found.determined)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bench", [True, False], ids=["bench", "building"])
 @pytest.mark.parametrize("of", ["reference", "sensor"])
 def test_a_corner_as_uncertain_as_stated_calibrates(of: str, bench: bool) -> None:
@@ -52,6 +53,7 @@ def test_a_corner_as_uncertain_as_stated_calibrates(of: str, bench: bool) -> Non
 
 # Of a sensor's corner what is left is second order: the product of the corner and of how far it is off, over the square
 # of the frequency at which S holds: 0.05 % here.
+@pytest.mark.slow
 @pytest.mark.parametrize(("of", "apart"), [("reference", 0.1), ("sensor", 0.6)])
 def test_the_result_is_that_of_instruments_without_a_corner(of: str, apart: float) -> None:
     with_corner = errors(Recording(4, drawn(4, of), bench=False), **SECTIONS[of])
@@ -59,6 +61,7 @@ def test_the_result_is_that_of_instruments_without_a_corner(of: str, apart: floa
     assert np.abs(with_corner - without).max() < apart
 
 
+@pytest.mark.slow
 def test_a_reference_with_gaps_has_an_integral_between_each_two_of_them() -> None:
     devices = drawn(4, "reference")
     whole = errors(Recording(4, devices, bench=False), **SECTIONS["reference"])
@@ -66,6 +69,7 @@ def test_a_reference_with_gaps_has_an_integral_between_each_two_of_them() -> Non
     assert np.abs(with_gaps - whole).max() < 0.3
 
 
+@pytest.mark.slow
 def test_a_velocity_reference_has_one_too() -> None:
     drawings = [drawn(k, "reference", derivatives=1, reference_noise=1e-5) for k in range(2)]
     stated = {"certificate": STATED | {"quantity": "velocity"}}
@@ -94,6 +98,7 @@ def beside_an_mcc172(hz: float, corner_hz: float, *, stated: bool) -> tuple[np.n
     return main / np.diag(recording.S) - 1.0, U / main
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("hz", "low"), [(1.6, 0.101), (3.2, 0.028)])
 def test_what_the_driver_mcc172_states_is_undone(hz: float, low: float) -> None:
     error, U = beside_an_mcc172(hz, 0.78, stated=False)
@@ -111,6 +116,7 @@ def test_what_the_driver_mcc172_states_agrees_with_both_figures_of_the_data_shee
     assert -0.1 < at_5_2_hz < -0.09
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner_hz", [0.1, 0.5, 1.0])
 def test_a_coupling_whose_corner_the_driver_does_not_know_is_in_u(corner_hz: float) -> None:
     options = NiOptions.model_validate({"channels": ["cDAQ1Mod1/ai0"], "iepe_ma": 2.0})
@@ -133,6 +139,7 @@ def test_a_corner_that_the_certificate_states_comes_before_that_of_the_driver() 
     assert Prior(filters=("flat",)).with_filters(filters).corner_hz == 0.78
 
 
+@pytest.mark.slow
 def test_a_corner_that_a_driver_states_anew_makes_s_uncertain_by_as_much() -> None:
     """As after an upgrade: the driver of a reference that reads 10 % low stated nothing, and now it does."""
     devices = Devices(reference_corner_hz=0.78, band_hz=(1.2, 2.0), lines=16, reference_filters=MCC172)

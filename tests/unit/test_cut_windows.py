@@ -56,6 +56,7 @@ def closed(config: Config, events: Sequence[Any]) -> list[WindowReport]:
     return [r for r in results if isinstance(r, WindowReport)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", UNCOUNTED)
 @pytest.mark.parametrize("config", [told, found])
 @pytest.mark.parametrize("hole_s", [0.5, HOLE_S])
@@ -94,6 +95,7 @@ def test_a_device_that_starts_anew_all_the_time_is_one_refused_window() -> None:
     assert window.numbers["restarts"] > 50
 
 
+@pytest.mark.slow
 def test_the_state_between_two_runs_of_samples_is_in_the_snapshot() -> None:
     for config in (told(), found()):
         events = [opened(), *holed(blocks(stay()), BlockFlags.RESTART)]
@@ -104,6 +106,7 @@ def test_the_state_between_two_runs_of_samples_is_in_the_snapshot() -> None:
         assert restored.snapshot() == going_on.snapshot()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["s", "r"])
 @pytest.mark.parametrize("flags", [BlockFlags.RESTART, BlockFlags.GAP])
 def test_beside_a_tri_axial_reference_too(device: str, flags: BlockFlags) -> None:
@@ -147,6 +150,7 @@ def _without_first(block: SampleBlock, n: int, flags: BlockFlags) -> SampleBlock
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("positions", [False, True])
 def test_sample_numbers_that_jump_at_will_cost_their_windows_and_the_agent_goes_on(positions: bool) -> None:
     """Numbers 0, 1, 0, 1, ... make no clock."""

@@ -134,11 +134,13 @@ def assert_same(shown: str, made: str) -> None:
         assert abs(float(old) - float(new)) <= allowed, f"{shown}\n{made}"
 
 
+@pytest.mark.slow
 def test_what_the_guide_says_beforehand() -> None:
     for line in guided.outlooks()[2:]:
         assert_same(line_of("guided", line[: line.index("|", 2) + 1]), line)
 
 
+@pytest.mark.slow
 def test_what_the_best_test_of_a_site_reaches() -> None:
     for line in site.bounds():
         assert_same(line_of("site-runs", line[: line.rindex("|", 0, -1)]), line)
@@ -153,6 +155,7 @@ def test_disturbances(monkeypatch: pytest.MonkeyPatch) -> None:
         assert_same(line_of("disturbed", line[: line.index("|", line.index("|", 1) + 1) + 1]), line)
 
 
+@pytest.mark.slow
 def test_the_delay_of_the_drift_test() -> None:
     page = (ROOT / "docs/online.md").read_text("utf-8")
     for name in ("step of 30 sigma", "step of 3 sigma", "step of 1 sigma", "ramp of 0.05 sigma a window"):
@@ -162,6 +165,7 @@ def test_the_delay_of_the_drift_test() -> None:
         assert_same(shown, f"| {name} | {' | '.join(f'{mean:.1f}' for mean in means)} |")
 
 
+@pytest.mark.slow
 def test_the_false_alarms_of_the_drift_test() -> None:
     page, windows = (ROOT / "docs/online.md").read_text("utf-8"), 1_200_000
     expected = windows * false_alarm_rate(8.0, FEWEST, SPAN)
@@ -182,6 +186,7 @@ def figures(name: str, begin: str) -> list[list[float]]:
     return [[float(number) for number in NUMBER.findall(cell)] for cell in line.split(" | ")[1:]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ["sensor lags by 5 ms", "offset differs by 0.05", "all together"])
 def test_plain_method_3_against_the_adjustment(row: str) -> None:
     number = next(k for k, each in enumerate(torture.ROWS) if each.name.startswith(row))
@@ -195,6 +200,7 @@ def test_plain_method_3_against_the_adjustment(row: str) -> None:
         assert_rms(adjusted[k], scale * column)
 
 
+@pytest.mark.slow
 def test_a_noisy_reference_on_a_structure() -> None:
     found = [torture_shm.one(seed) for seed in range(1)]
     naive, errors, u, _ = (np.array(each) for each in zip(*found, strict=True))
@@ -205,6 +211,7 @@ def test_a_noisy_reference_on_a_structure() -> None:
     assert_rms(float(np.mean(rms)), 100.0 * errors.ravel())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [0, 2])
 def test_one_frequency(line: int) -> None:
     motion_hz, corner_hz, order = one_frequency.LINES[line]

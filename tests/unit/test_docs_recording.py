@@ -42,6 +42,7 @@ def test_it_imports_nothing_of_this_program() -> None:
     assert named == {"google", "mcap", "numpy", "re"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["of today", *(f"format-{k}" for k in (1, 2, 3))])
 def test_all_samples_and_arrivals_are_those_of_the_program(kind: str, recorded: Path) -> None:
     names = run(READER)
@@ -92,6 +93,7 @@ def test_s_by_plain_least_squares_is_the_published_one(
     assert re.fullmatch(r"[\d.]+ published: [\d.]+ u: [\d.]+\n", capsys.readouterr().out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("right", "wrong"),
     [

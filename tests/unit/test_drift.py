@@ -44,6 +44,7 @@ class Feed:
         return self
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threshold", [7.0, 9.0])
 def test_false_alarms_are_as_many_as_the_formula_says(threshold: float) -> None:
     """1.2 million windows: at threshold 9 expect 120 alarms, one standard deviation 9 %; a threshold off by 0.3 shows.
@@ -91,6 +92,7 @@ def test_a_step_of_30_sigma_is_found_with_the_third_window(seed: int) -> None:
     assert after.change == pytest.approx(-30.0, abs=4 * after.u_change)
 
 
+@pytest.mark.slow
 def test_a_step_of_1_sigma_is_found_in_days() -> None:
     """20 seeds: (b^2 / 2 = 14.2 is reached after 28 windows on average where the onset is known)."""
     delays, changes = [], 0

@@ -46,6 +46,7 @@ def rates(*which: int) -> np.ndarray:
     return np.where(np.isin(np.arange(12), which), [*[RATE] * 9, *[1e-3] * 3], 0.0)
 
 
+@pytest.mark.slow
 def test_the_rates_are_recovered_and_q_and_s_go_on_with_them() -> None:
     found = told_of_a_drift(range(1, 30), rates(SYY, QX))
     rate, u = found.quantity("Syy_rate")

@@ -70,6 +70,7 @@ def same(one: list[CalibrationUpdate], other: list[CalibrationUpdate]) -> bool:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backwards", [False, True])
 def test_what_drivers_state_counts_as_if_the_configuration_stated_it(*, backwards: bool) -> None:
     config = drawn().config
@@ -78,12 +79,14 @@ def test_what_drivers_state_counts_as_if_the_configuration_stated_it(*, backward
     assert not same(calibrations(config, events({})), by_configuration)
 
 
+@pytest.mark.slow
 def test_the_configuration_comes_before_the_driver() -> None:
     config = stating(drawn().config, prior=NEAR_TEXT, certificate=["flat"])
     other = {"sensor": ("lowpass corner_hz=40",), "reference": ("lowpass corner_hz=30",)}
     assert same(calibrations(config, events(other)), calibrations(config, events({})))
 
 
+@pytest.mark.slow
 def test_s_is_right_beside_the_filters_of_an_adxl355_and_held_where_nobody_states_them() -> None:
     case = (62.5, 12.0, 0.003)  # 24 ms late
     found, without = (chip.one((case, kind, chip.SEED)) for kind in ("sensor", "nothing"))
@@ -95,11 +98,13 @@ def test_s_is_right_beside_the_filters_of_an_adxl355_and_held_where_nobody_state
     assert without.used < chip.TIMING.windows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [1, 2, 60])  # between the openings of the devices, after them, within a window
 def test_a_restored_state_goes_on_bit_for_bit(cut: int) -> None:
     assert_goes_on(drawn().config, list(events(STATED)), cut)
 
 
+@pytest.mark.slow
 def test_a_recording_carries_them_so_that_its_audit_gives_the_same_results(tmp_path: Path) -> None:
     path = recorded(tmp_path / "data", STATED)
     results = [result for step in RecordingReader(path).steps() for result in step.results]
@@ -126,6 +131,7 @@ def calibrated(path: Path, *options: str) -> list[list[float]]:
     return json.loads(out.read_text())["sensitivity"]  # type: ignore[no-any-return]
 
 
+@pytest.mark.slow
 def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     coupled = {**STATED, "reference": ("flat", "highpass corner_hz=0.01 u_corner_pct=30")}
     with_it, without = recorded(tmp_path / "a", coupled), recorded(tmp_path / "b", STATED)
@@ -137,6 +143,7 @@ def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest
     assert calibrated(with_it, *own) == calibrated(without, *own) != stated
 
 
+@pytest.mark.slow
 def test_calibrate_uses_the_filters_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with_them, without = recorded(tmp_path / "a", STATED), recorded(tmp_path / "b", {})
     options = ["--sensor-filter", NEAR_TEXT[0], "--reference-filter", "flat"]
@@ -216,6 +223,7 @@ def restarted(before: Building, after: Building) -> tuple[list[bool], list[str],
     return [report.used for report in gateway.reports[windows:]], gateway.reasons[told:], gateway.status
 
 
+@pytest.mark.slow
 def test_another_output_data_rate_at_the_next_start_is_another_filter_and_no_drift() -> None:
     used, told, status = restarted(Chip(62.5), Chip(125.0))
     assert told[0] == f"restored from the previous run; {OTHER_FILTERS}"
@@ -223,6 +231,7 @@ def test_another_output_data_rate_at_the_next_start_is_another_filter_and_no_dri
     assert status == "VALID"
 
 
+@pytest.mark.slow
 def test_the_same_rate_at_the_next_start_is_the_same_filter_also_while_the_reference_is_not_open_yet() -> None:
     used, told, status = restarted(Chip(62.5), Chip(62.5))
     assert told[0] == "restored from the previous run"
@@ -231,6 +240,7 @@ def test_the_same_rate_at_the_next_start_is_the_same_filter_also_while_the_refer
     assert status == "VALID"
 
 
+@pytest.mark.slow
 def test_a_device_with_another_setting_that_is_no_filter_is_another_device() -> None:
     _, told, _ = restarted(Chip(62.5, told=False), Chip(125.0, told=False))
     assert told[0].startswith("the stored calibration belongs to")

@@ -84,6 +84,7 @@ def made(target: Path, given: dict[str, Path], capsys: pytest.CaptureFixture[str
     return status, told.out + told.err
 
 
+@pytest.mark.slow
 def test_archive_holds_all_and_audits_by_sh_alone(
     tmp_path: Path, given: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -124,6 +125,7 @@ def test_archive_holds_all_and_audits_by_sh_alone(
 BASE = f"python/lib/{PYTHON}/os.py"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "content", "told"),
     [

@@ -95,6 +95,7 @@ def test_pipeline_that_raises_is_told_and_the_next_file_begins(process: EnginePr
     assert process.begin("fieldcal.v1.Event", encode(0, start)) == (0, [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("does", "told"),
     [
@@ -278,6 +279,7 @@ def test_frames_that_arrive_byte_by_byte_are_those_that_were_sent() -> None:
     assert got == sent
 
 
+@pytest.mark.slow
 def test_size_of_memory_that_a_real_engine_needs(process: EngineProcess) -> None:
     """The default limit leaves three quarters of the address space free."""
     status = Path(f"/proc/{process._process.pid}/status").read_text()

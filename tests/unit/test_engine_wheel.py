@@ -47,6 +47,7 @@ def test_wheel_is_the_same_from_another_place_at_another_time(own: bytes, tmp_pa
     assert hashlib.sha256(other.stdout).hexdigest() == hashlib.sha256(own).hexdigest()
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_sources_of_the_engine_and_is_small(own: bytes) -> None:
     assert len(own) < 600_000
     wheel = read_wheel("own", own)

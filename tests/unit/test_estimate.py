@@ -111,6 +111,7 @@ def many(random: np.random.Generator, number: int, cadence: float, **more: objec
     return [Record.of(window, k * cadence, 0.0, 20.0 + 3.0 * np.sin(k), "A") for k, window in enumerate(made)]
 
 
+@pytest.mark.slow
 def test_thinned_records_say_the_same() -> None:
     records = many(np.random.default_rng(7), 180, 0.25)
     wander = walking(sensitivity=2e-5, offset_mps2=1e-3)
@@ -146,6 +147,7 @@ def test_windows_are_brought_to_one_lag_before_they_are_merged() -> None:
     np.testing.assert_allclose(mixed.slopes_at_lag(alone.lag_s) / size, alone.slopes / size, rtol=0, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_direction_that_nothing_excites_learns_nothing_at_a_mount_that_never_turns() -> None:
     """Motion along y with a noisy reference: 120 windows, and S_xx stays as uncertain, and where, it was."""
     random = np.random.default_rng(10)

@@ -65,6 +65,7 @@ def actions(judged: list[Judged]) -> list[str]:
     return [j.decision.action for j in judged]
 
 
+@pytest.mark.slow
 def test_a_jump_needs_as_many_windows_that_agree_as_the_configuration_says() -> None:
     random = np.random.default_rng(1)
     found = settled(random, gate={"confirm_windows": 12})
@@ -79,6 +80,7 @@ def test_a_jump_needs_as_many_windows_that_agree_as_the_configuration_says() -> 
     assert abs(found.in_force.sensitivity[1, 1] - OF_Y[1, 1]) < 3e-3
 
 
+@pytest.mark.slow
 def test_a_step_too_small_for_any_window_alone_is_followed() -> None:
     random = np.random.default_rng(2)
     process, exact = {"sensitivity_pct": 0.0}, {"stability_pct": 0.0}
@@ -115,6 +117,7 @@ def test_what_a_certificate_tells_well_is_in_force_from_the_first_window_and_fol
     assert abs(found.in_force.sensitivity[1, 1] - OF_Y[1, 1]) < 3e-3
 
 
+@pytest.mark.slow
 def test_another_lag_after_a_line_began_anew_is_no_end_of_it() -> None:
     random = np.random.default_rng(4)
     found = settled(random)
@@ -149,6 +152,7 @@ def test_a_larger_uncertainty_is_in_force_although_rounding_moved_the_state() ->
         assert ratio[[1, 7]].min() > 1.1, f"rounding {rounding:g}"  # the motion is along y
 
 
+@pytest.mark.slow
 def test_a_wild_window_among_the_held_ones_does_not_stand_in_the_way() -> None:
     random = np.random.default_rng(5)
     found = settled(random)
@@ -222,6 +226,7 @@ def test_of_two_proposals_of_one_step_each_can_be_accepted_by_its_number() -> No
     np.testing.assert_array_equal(accepted.sensitivity, second.sensitivity)
 
 
+@pytest.mark.slow
 def test_a_snapshot_in_the_midst_of_a_jump_goes_on_bit_for_bit() -> None:
     random = np.random.default_rng(10)
     going_on = settled(random)
@@ -234,6 +239,7 @@ def test_a_snapshot_in_the_midst_of_a_jump_goes_on_bit_for_bit() -> None:
     assert pack(other.snapshot()) == pack(going_on.snapshot())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("a_day", "most"),
     [

@@ -105,6 +105,7 @@ def test_a_date_stated_later_is_the_same_reference_and_another_date_is_a_new_cal
     assert anew.result().standard_uncertainty[0] == pytest.approx(3e-3 / np.sqrt(2.0), rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_calibration_put_back_does_not_count_the_error_of_the_reference_again() -> None:
     found = lived(12)
     for turn in range(8):

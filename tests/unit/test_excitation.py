@@ -293,6 +293,7 @@ def test_an_axis_that_never_changes_is_dead() -> None:
     assert window.reason == "dead: the output of 1 of the sensor's axes does not change at all"
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0005, 1.0), longest_s=st.floats(0.01, 60.0))
 @settings(max_examples=60)
 @example(seed=0, share=0.0625, longest_s=0.0625)

@@ -42,6 +42,7 @@ def statuses(harm: Harm, seed: int = 1) -> list[StatusChange]:
     return [r for r in results if isinstance(r, StatusChange)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("harm", "best", "size", "remedy"),
     [
@@ -69,6 +70,7 @@ def test_the_status_says_what_explains_the_held_windows_best(harm: Harm, best: s
     assert remedy in told.reason
 
 
+@pytest.mark.slow
 def test_a_mount_that_leans_is_named_for_as_long_as_its_windows_are_held() -> None:
     """A window every nine days. The more the state may have wandered since its last window, the less chi-squared has
     beyond chance; in the end the held windows contradict nothing, but would change Q by more than is allowed. With a
@@ -86,12 +88,14 @@ def test_a_mount_that_leans_is_named_for_as_long_as_its_windows_are_held() -> No
     assert (contradicted[0], contradicted[-1]) == (True, False)
 
 
+@pytest.mark.slow
 def test_either_of_two_that_fit_alike_is_named() -> None:
     [told] = [s for s in statuses(Transformed("sensor", "sensor", np.diag([1.0, 1.08, 1.0]))) if s.before == "HELD"]
     assert "another reference sensitivity (reference_y -7" in told.reason
     assert "another sensitivity (Syy +7" in told.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("response", "change"), [(lowpass(1, 25.0), "smaller"), (resonance(25.0, 10.0), "larger")])
 def test_another_filter_is_named_with_its_frequency(response: Filter, change: str) -> None:
     """At 12.8 Hz the low-pass filter of 25 Hz lets 0.890 pass, the resonance 1.355."""
@@ -101,6 +105,7 @@ def test_another_filter_is_named_with_its_frequency(response: Filter, change: st
     assert "set it back, tighten the mount" in told.reason
 
 
+@pytest.mark.slow
 def test_nothing_is_explained_where_nothing_is_held() -> None:
     said = [s for s in statuses(Harm()) if "windows have this band in common" not in s.reason]
     assert [s.status for s in said] == ["UNCALIBRATED", "VALID"]

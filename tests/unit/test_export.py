@@ -54,6 +54,7 @@ def truth() -> tuple[np.ndarray, np.ndarray]:
     return made.sensor_time_s[:count] + EPOCH_NS * 1e-9, np.asarray(made.v[:count], dtype=float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_a_table_has_times_indications_and_accelerations(
     ending: str, recorded: Path, truth: tuple[np.ndarray, np.ndarray], tmp_path: Path,
@@ -167,6 +168,7 @@ def test_without_pyuff_it_says_what_to_install(tmp_path: Path, monkeypatch: pyte
         write_uff(tmp_path / "a.uff", Content("a", "m/s2", 1), [])
 
 
+@pytest.mark.slow
 def test_miniseed_has_each_block_at_its_own_time(
     recorded: Path, truth: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -339,6 +341,7 @@ def test_the_unit_of_a_device_is_no_formula_in_a_header(tmp_path: Path) -> None:
     assert cell("=cmd") == "'=cmd"
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     """Three times as many blocks, both more than a chunk of MCAP: the same memory."""
 

@@ -93,6 +93,7 @@ def install(part: parts.Extra, directory: Path) -> subprocess.CompletedProcess[s
     return subprocess.run([*command, "--target", directory / "installed"], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_wheels_beside_it_are_enough(part: parts.Extra, tmp_path: Path) -> None:
     """The command installs the wheel, into a directory of its own and without any index."""
     done = install(part, tmp_path)
@@ -100,6 +101,7 @@ def test_wheels_beside_it_are_enough(part: parts.Extra, tmp_path: Path) -> None:
     assert (tmp_path / "installed/fieldcal_test_part.py").exists()
 
 
+@pytest.mark.slow
 def test_a_wheel_with_another_content_is_refused(part: parts.Extra, tmp_path: Path) -> None:
     (wheel,) = (tmp_path / "wheels").iterdir()
     with zipfile.ZipFile(wheel, "a") as file:

@@ -102,6 +102,7 @@ print(json.dumps({"phases": phases, "said": said, "kept": kept, "files": len(aud
 """
 
 
+@pytest.mark.slow
 @pytest.mark.root
 @needs_root
 def test_a_disk_that_is_full(tmp_path: Path) -> None:

@@ -193,6 +193,7 @@ def test_a_certificate_of_all_axes_needs_a_reference_that_measures_gravity(
     assert "needs a reference that measures gravity itself" in told["links"][1]["reasons"][0]
 
 
+@pytest.mark.slow
 def test_one_link_alone_is_what_calibrate_finds(tmp_path: Path) -> None:
     recording = Recording(5, Devices(), bench=True, stand_s=12.0)
     stated = ("--nominal", "1", "--u-nominal-pct", "5", "--reference-coupling", "dc")
@@ -207,6 +208,7 @@ def test_one_link_alone_is_what_calibrate_finds(tmp_path: Path) -> None:
     assert np.array(found["covariance"]) == pytest.approx(np.array(alone["covariance"]), rel=1e-3, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_recordings_need_no_list_of_meetings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = record(tmp_path, 130.0)
     (recording,) = tmp_path.glob("*.mcap")

@@ -78,6 +78,7 @@ def written(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
+@pytest.mark.slow
 def test_one_bad_file_is_told_and_the_others_have_the_same_bits_with_one_and_two_processes(
     recordings: Path, tmp_path: Path
 ) -> None:
@@ -93,6 +94,7 @@ def test_one_bad_file_is_told_and_the_others_have_the_same_bits_with_one_and_two
     assert len(written(tmp_path / "one")) == 4
 
 
+@pytest.mark.slow
 def test_dask_gives_the_same_bits(recordings: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra fleet is not installed")
     (tmp_path / "one").mkdir()
@@ -114,6 +116,7 @@ def test_dask_gives_the_same_bits(recordings: Path, tmp_path: Path) -> None:
     assert written(tmp_path / "one") == written(tmp_path / "dask")
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_whole_results_and_no_process_and_goes_on(recordings: Path, tmp_path: Path) -> None:
     many, out = tmp_path / "many", tmp_path / "out"
     many.mkdir()
@@ -142,6 +145,7 @@ def _runs(pid: int) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_a_changed_file_another_setting_and_a_spoilt_result_are_computed_again(
     recordings: Path, tmp_path: Path
 ) -> None:
@@ -167,6 +171,7 @@ def run_or_end(task: Task) -> bytes:
     return run_task(task)
 
 
+@pytest.mark.slow
 def test_a_file_that_ends_its_process_is_refused_alone(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,6 +279,7 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     running.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("bucket")
 def test_recordings_in_an_object_store(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import s3fs

@@ -52,6 +52,7 @@ def run(directory: Path, rows: list[Any], *options: str) -> Result:
     return CliRunner().invoke(fleet, ["watch", str(file), *options], standalone_mode=False)
 
 
+@pytest.mark.slow
 def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     told = run(tmp_path, clean, "--json", "-")
     assert told.exception is None

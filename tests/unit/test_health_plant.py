@@ -62,6 +62,7 @@ def situations(directory: Path) -> tuple[Situation, Situation]:
     return before, after
 
 
+@pytest.mark.slow
 def test_memory_threads_files_and_disk_are_the_processs_own(tmp_path: Path) -> None:
     """In a process of its own: in this one, connections and threads of earlier tests end when they like."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:

@@ -66,6 +66,7 @@ def test_three_percent_of_lost_samples_leave_one_window(lost: str) -> None:
     assert not {"filled_samples", "reference_filled_samples"} & set(whole.numbers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", ["sensor", "reference"])
 def test_the_filtered_samples_are_those_without_loss(lost: str) -> None:
     """Twenty seeds: 3 % of the information is gone, and no more than that comes in as error.
@@ -84,6 +85,7 @@ def test_the_filtered_samples_are_those_without_loss(lost: str) -> None:
     assert 0.3 < np.mean(excess) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", ["", "sensor", "reference"])
 def test_the_sensitivity_scatters_as_the_real_samples_tell(lost: str) -> None:
     """Forty seeds of nine coefficients: errors over u from the independent points, rms within chi2's 99.9 %."""

@@ -208,6 +208,7 @@ frames_of_binary = st.one_of(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [

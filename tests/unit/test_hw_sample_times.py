@@ -19,7 +19,7 @@ from hw.virtual.lsm6dso_twin import Lsm6dsoTwin
 from hw.virtual.mpu6050_twin import Mpu6050Twin
 from hw.virtual.timebase import Clock
 
-SECONDS = 120.0
+SECONDS = 90.0
 RESONANT_125_HZ, RESONANT_500_HZ = 2.381966 / (125.0 * 0.02) - 1, 8.381966 / (500.0 * 0.016) - 1
 # Scheduler: 0.2 ms mean, 1 % stalls of 5 to 20 ms, as measured on a loaded gateway. The FIFO is large enough for them.
 MEAN_LATE_S, STALLS, STALL_S = 0.2e-3, 0.01, (5e-3, 20e-3)
@@ -43,6 +43,7 @@ class Machine:
         self.t_s += seconds + late_s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("driver", "twin", "options", "rate_error", "bias_us", "sd_us", "largest_us"),
     [
@@ -56,7 +57,7 @@ class Machine:
         (Adxl355, Adxl355Twin, {"rate_hz": 500.0}, RESONANT_500_HZ, 50, 50, 150),
     ],
 )
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.thorough)])
 def test_sample_times(
     driver: type[FifoSensor],
     twin: type[FifoTwin],

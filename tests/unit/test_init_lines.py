@@ -91,6 +91,7 @@ DECIDED: dict[str, tuple[Callable[[int], str], dict[str, Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DECIDED)
 def test_what_init_writes_is_read_without_a_loss(name: str, tmp_path: Path) -> None:
     line, options = DECIDED[name]
@@ -169,6 +170,7 @@ def test_stated_lines_are_not_listened_to(tmp_path: Path) -> None:
     assert (options["columns"], options["axes"], options["sequence"]) == (["seq", "a", "-"], 1, True)
 
 
+@pytest.mark.slow
 def test_the_columns_on_a_terminal(tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"
     with writing(lambda _: f"{REST},23.5\n") as port:

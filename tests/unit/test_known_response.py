@@ -53,6 +53,7 @@ def drawn(seed: int, order: int, corner_hz: float) -> Filter:
     return lowpass(order, corner_hz * (1.0 + U_CORNER * np.random.default_rng([13, seed]).normal()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("in_reference", [False, True])
 @pytest.mark.parametrize("order", [2, 4])
 def test_a_stated_filter_of_which_the_corner_is_a_tenth_off(order: int, in_reference: bool) -> None:
@@ -68,6 +69,7 @@ def test_a_stated_filter_of_which_the_corner_is_a_tenth_off(order: int, in_refer
     assert found.lag_s == pytest.approx(without.lag_s, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_a_filter_whose_corner_is_within_the_motion_is_right_only_if_it_is_stated() -> None:
     response, known = lowpass(4, 16.1), known_of(["lowpass order=4 corner_hz=16 u_corner_pct=1"], ["flat"])
     made, found = recorded(2, response, known)
@@ -110,6 +112,7 @@ def test_the_response_of_the_sensor_is_told_with_its_filter_and_without_that_of_
     assert found.more["sensitivity_at_0hz"]["sensitivity"][0, 0] == pytest.approx(gain, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_coverage_with_corners_drawn_from_their_uncertainty() -> None:
     """24 runs, seeds 200 to 223; the reference's error is drawn as well. benchmarks.response has more."""
     inside = 0

@@ -18,6 +18,7 @@ GUARD_S = 0.5  # at the begin of the first window
 SINCE_S = np.array([131.0, 173.0, 204.0, 245.0])  # at the begin, in the middle and at the end of windows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["sensor", "reference"])
 def test_every_window_is_used_right_and_tells_how_many_samples_were_late(device: str) -> None:
     drawn = node(3, all_axes=True, stated=Stated(lag_s=0.02), timing=Timing(WINDOW_S, 0.0, WINDOWS))

@@ -57,6 +57,7 @@ def of_bands(of: Pair) -> LeftOpen:
     return bands.left_open
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_reference", [True, False])
 def test_noise_alike_in_all_bands_may_be_the_references(of_reference: bool) -> None:
     """1 % of the motion's power: S is up to 1 % too small. Before, S was off by 9.6 u of 0.1 %."""
@@ -69,6 +70,7 @@ def test_noise_alike_in_all_bands_may_be_the_references(of_reference: bool) -> N
         assert (away.mean() < -0.006) == of_reference
 
 
+@pytest.mark.slow
 def test_white_noise_that_shows_beside_the_motion_is_the_sensors() -> None:
     """A tenth of the motion: as much incoherence as above, and its level at other frequencies tells whose it is."""
     for seed in range(3):
@@ -108,6 +110,7 @@ def test_without_noise_nothing_is_lost() -> None:
     assert found.more["budget"]["response by axis"]["Sxx"] < 1e-5
 
 
+@pytest.mark.slow
 def test_the_part_of_axes_that_differ_is_that_of_a_corner() -> None:
     """A low-pass of first order has ln |h| = -ln(1 + (f / f0)^2) / 2, whose derivative by ln f0 is (f / f0)^2 / (1 +
     (f / f0)^2): its mean over the motion less that where S holds, by quadrature."""
@@ -147,6 +150,7 @@ def test_axes_whose_corners_differ_by_one_per_cent_are_covered(seeds: int) -> No
     assert 0.4 < np.sqrt(np.mean(np.square(z))) < 1.2
 
 
+@pytest.mark.slow
 def test_sums_add_and_are_kept() -> None:
     of, _ = made(within(0.01, of_reference=True), 1)
     windows = [excited(w) for w in of.files.windows(0.0) if w.used]
@@ -164,6 +168,7 @@ def test_sums_add_and_are_kept() -> None:
     assert LeftOpen().by_axis(np.ones(5), np.zeros(5)) == (0.0, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("disturbed", "source", "least"),
     [(within(0.01, of_reference=True), "whose noise it is", 0.004), (undisturbed, "response by axis", 5e-4)],
@@ -185,6 +190,7 @@ def test_the_agent_says_what_files_say(disturbed: Disturbance, source: str, leas
     assert ((ratio > 0.9) & (ratio < 1.1)).all(), ratio
 
 
+@pytest.mark.slow
 def test_corners_that_differ_explain_deviations_of_bands() -> None:
     """A low-pass of first order: ln h = -ln(1 + i f / f0), whose derivative by ln f0 is i f / f0 / (1 + i f / f0). What
     neither a gain nor a lag explains of it, by quadrature; three axes differ from their mean by two thirds of the mean

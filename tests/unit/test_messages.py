@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agent.core.events import (
@@ -73,7 +73,9 @@ def through_the_wire(event_sequence: int, item: Any) -> Any:
     return decoded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", STRUCTS)
+@settings(max_examples=40)
 @given(data=st.data())
 def test_every_event_and_result_comes_back_as_it_was(kind: type[msgspec.Struct], data: st.DataObject) -> None:
     item = data.draw(struct_items(kind))
@@ -81,6 +83,7 @@ def test_every_event_and_result_comes_back_as_it_was(kind: type[msgspec.Struct],
     assert bits(msgspec.structs.asdict(through_the_wire(number, item))) == bits(msgspec.structs.asdict(item))
 
 
+@pytest.mark.slow
 @given(numbers=st.lists(NUMBER | st.sampled_from(SPECIAL), min_size=28, max_size=28), cells=st.data())
 def test_calibration_comes_back_as_it_was(numbers: list[float], cells: st.DataObject) -> None:
     covariance = cells.draw(st.lists(st.sampled_from(SPECIAL), min_size=144, max_size=144))

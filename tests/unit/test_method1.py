@@ -86,6 +86,7 @@ def test_six_values_a_run_and_their_statistics() -> None:
     assert np.sqrt(np.mean([r.s_rel_pct**2 for r in runs])) == pytest.approx(0.0155 / 1.02, rel=4 / np.sqrt(30))
 
 
+@pytest.mark.slow
 def test_type_a_covers() -> None:
     # 300 calibrations of one run; S_xx and S_yx come from independent outputs. |z| <= k, k by 5 or fewer degrees of
     # freedom, in 95.45 % of 600: 99.9 % binomial band 555 .. 588; the normal k = 2 would reach 540.
@@ -147,6 +148,7 @@ def test_data_that_cannot_be_used_are_named() -> None:
     assert any("its sign cannot be told" in reason for reason in late.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rests_s", [(0.9, 0.0), (0.0, 1.3), (0.7, 0.8), (1.45, 0.6)])
 @pytest.mark.parametrize("lag_s", [0.0, 0.004])
 def test_rests_beside_the_sine_are_left_out(rests_s: tuple[float, float], lag_s: float) -> None:

@@ -87,6 +87,7 @@ def outside(limit: float, sensors: int, seed: int) -> tuple[int, float]:
     return int(np.sum(np.array(ratio) > 1)), float(np.max(ratio))
 
 
+@pytest.mark.slow
 def test_the_truth_lies_within_u_on_sensors_with_transverse_sensitivities() -> None:
     # Anywhere within the 5 % that the method allows: U (k = 2) is to cover 95.45 % at least; the sum of two equal
     # rectangular ones is outside 2 SDs in (1 - 2 / sqrt 6)^2 = 3.4 %. 99.9 % binomial limits of 900: 14 .. 50.

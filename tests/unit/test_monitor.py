@@ -39,6 +39,7 @@ def gateway(site: Site, tmp_path: Path) -> Iterator[Publisher]:
     store.close()
 
 
+@pytest.mark.slow
 def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway: Publisher, tmp_path: Path) -> None:
     monitor = Monitor(site.endpoint, tmp_path / "monitor")
     try:
@@ -60,6 +61,7 @@ def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway:
         monitor.stop(signal.SIGTERM)
 
 
+@pytest.mark.slow
 def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(tmp_path: Path) -> None:
     """While no router answers: Ctrl-C ends the monitor well all the same.
 

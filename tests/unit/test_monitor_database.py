@@ -78,6 +78,7 @@ def engine_of(request: pytest.FixtureRequest, directory: Path) -> Engine:
     return engine
 
 
+@pytest.mark.slow
 def test_results_come_back_whole_in_order_and_each_once(kept: Kept) -> None:
     whole = [kept.add(calibration(k, sxx=26000.0 + k), START + k * MINUTE) for k in (1, 2, 3)]
     kept.add(calibration(2, sxx=1.0), START + 2 * MINUTE)

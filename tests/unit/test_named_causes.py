@@ -282,6 +282,7 @@ def in_ms(table: Table) -> Table:
     return 1000.0 * table[0], table[1]
 
 
+@pytest.mark.slow
 def test_times_in_ms_are_named_for_the_table_that_has_them() -> None:
     sensor, reference = triad(seconds=20.0)
     for given, name in (((in_ms(sensor), reference), "sensor"), ((sensor, in_ms(reference)), "reference")):
@@ -295,6 +296,7 @@ def test_times_in_ms_are_named_for_the_table_that_has_them() -> None:
     right(of_twenty_seconds())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("channel", "times"), [(0, 0.0), (1, 1.0 / 30.0), (2, 0.0)])
 def test_a_dead_channel_of_the_reference_is_named_and_no_output_called_dead(channel: int, times: float) -> None:
     sensor, (t, a) = triad()
@@ -310,6 +312,7 @@ def test_a_dead_channel_of_the_reference_is_named_and_no_output_called_dead(chan
     assert not any(reason.startswith("output ") for reason in found.reasons)
 
 
+@pytest.mark.slow
 def test_a_dead_channel_is_found_behind_a_rotation() -> None:
     sensor, (t, a) = triad(turn=QUARTER_TURN)
     dead = a.copy()
@@ -318,6 +321,7 @@ def test_a_dead_channel_is_found_behind_a_rotation() -> None:
     right(beside(sensor, (t, a), rotation=QUARTER_TURN))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("until_s", [15.0, 40.0])
 def test_an_output_that_is_stuck_is_named(until_s: float) -> None:
     (t, V), reference = triad()
@@ -336,6 +340,7 @@ MIXED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MIXED)
 def test_exchanged_and_inverted_outputs_are_named_where_a_nominal_is_stated(name: str) -> None:
     place, *told = MIXED[name]
@@ -345,12 +350,14 @@ def test_exchanged_and_inverted_outputs_are_named_where_a_nominal_is_stated(name
         assert part in reason
 
 
+@pytest.mark.slow
 def test_a_nominal_sensitivity_per_g_is_named() -> None:
     given = clamped()
     reason = only_reason(calibrate(*given, nominal=26.0 * G_MPS2, u_nominal_pct=10.0))
     assert "all main sensitivities are about 0.102 times what was expected: the prior is per g; convert it" in reason
 
 
+@pytest.mark.slow
 def test_a_self_test_that_was_left_on_for_some_windows_is_named() -> None:
     (t, V), reference, poses = clamped()
     on = V.copy()
@@ -361,6 +368,7 @@ def test_a_self_test_that_was_left_on_for_some_windows_is_named() -> None:
     right(calibrate((t, on), reference, poses[4:]))
 
 
+@pytest.mark.slow
 def test_a_self_test_that_was_on_all_the_time_contradicts_what_was_known() -> None:
     (t, V), reference, poses = clamped()
     known = calibrate((t, V), reference, poses)

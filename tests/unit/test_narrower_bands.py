@@ -34,6 +34,7 @@ def relative(made: Pair, response: Filter, found: Outcome) -> tuple[float, float
     return float(np.abs(np.diag(away)).max()), float(np.nanmax(np.abs(away.ravel()) / found.expanded_uncertainty[:9]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("response", "skirts"),
     [(lowpass(2, 1.56 * TO_HZ), 2), (resonance(3.0 * TO_HZ, 5.0), 4)],
@@ -52,6 +53,7 @@ def test_motion_that_reaches_into_a_filter_is_used_below_it(response: Filter, sk
     assert TO_HZ < high_hz < 3.0 * TO_HZ
 
 
+@pytest.mark.slow
 def test_a_resonance_that_hides_the_motion_in_all_windows() -> None:
     """Q 50 at 1.5 times the upper end: no window follows the reference, unless it is limited."""
     response = resonance(1.5 * TO_HZ, 50.0)
@@ -83,6 +85,7 @@ def test_motion_that_fills_the_spectrum_is_no_noise_of_the_reference() -> None:
     assert over_u < 1.0
 
 
+@pytest.mark.slow
 def test_a_pair_that_passes_at_once_is_limited_to_no_band() -> None:
     made = earthquake(1, decimator(2.0 * TO_HZ), 4)
     found = adjusted(made.files, Priors(reference=U_REFERENCE))
@@ -98,6 +101,7 @@ def notched(frequency_hz: np.ndarray) -> Complex:  # type: ignore[type-arg]
     return np.asarray(1.0 - 0.3 * np.exp(-0.5 * ((frequency_hz - 6.0) / 0.3) ** 2) + 0j)
 
 
+@pytest.mark.slow
 def test_a_notch_just_above_the_narrower_band_does_not_bend_s() -> None:
     """Limited to 5.4 Hz the bands deviate by less than 0.1 % from one response, and S is 0.2 % off (7 u): 3.8 Hz shows
     it."""

@@ -29,6 +29,7 @@ def _session(stops, stated, wanted=None):
     return Session(stops, stated, wanted or Wanted(), expected=Expected(rms_mps2, NOISE_MPS2, STAY_S * RATE_HZ))
 
 
+@pytest.mark.slow
 def test_the_promise_is_what_the_adjustment_tells():
     """The covariance after six stops, foretold at the S that was found; offsets scatter less than stated."""
     user, session, stops = User.drawn(3, 0.5 * OFFSET_MPS2), _session(TWO, STATED), []
@@ -118,6 +119,7 @@ def test_six_faces_are_repeated_where_offsets_scatter():
     assert 6 < told.stops <= 12
 
 
+@pytest.mark.slow
 def test_wrong_turns_are_noticed_and_named_and_right_ones_are_not_called_wrong():
     for seed in range(2):
         user, session = User.drawn(seed, OFFSET_MPS2), Session(TWO, STATED, Wanted())
@@ -152,6 +154,7 @@ def test_what_is_wanted_is_the_only_measure():
     assert not Wanted(5e-4, 1.0).reached(np.where(MAIN, 6e-4, 0.0))
 
 
+@pytest.mark.slow
 def test_a_first_stop_that_was_wrong_is_found_by_the_later_ones():
     """A turn of 15 deg at the first stop, where S is not known yet, looks possible; a later stop finds it by name."""
     user, session = User.drawn(0, OFFSET_MPS2), _session(TWO, STATED)

@@ -17,6 +17,7 @@ from tests.unit.test_estimation import estimation, hours
 LEVELS_MPS2 = np.geomspace(0.02, 0.2, 8)
 
 
+@pytest.mark.slow
 def test_noise_that_doubles_is_told_within_three_windows_and_so_is_its_end() -> None:
     """A window that moves more than nearly all of the first ones would tell less."""
     random, found = np.random.default_rng(1), estimation()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from calib.estimate.nuisances import Priors
 from calib.excitation.bands import band_sums, motion_band_hz
@@ -47,6 +48,7 @@ def test_a_band_with_noise_alone_is_no_motion() -> None:
     assert band_hz[1] < 22.0
 
 
+@pytest.mark.slow
 def test_noise_of_a_slow_reference_that_grows_with_frequency() -> None:
     """3 % of the motion in the middle of its band. Before, all were refused. Of 54 elements all but a sixth are within
     2 u (of a perfect estimator more are beyond in one of 7000 cases), and none is beyond 4 u."""
@@ -61,6 +63,7 @@ def test_noise_of_a_slow_reference_that_grows_with_frequency() -> None:
     assert np.abs(z).max() < 4.0
 
 
+@pytest.mark.slow
 def test_half_of_a_slow_motion_is_lost_and_no_more() -> None:
     """Noise as strong as the motion above half of its band; before, four of six were refused, u 5 times as large."""
     half = noise(lambda f: np.where(f > 1.0, density(SLOW_HZ), 0.0), of_reference=True)

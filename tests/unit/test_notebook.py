@@ -111,6 +111,7 @@ def pair(columns: Columns) -> tuple[Any, Any]:
     return time_s, np.column_stack(values) if len(values) > 1 else values[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [frame, structured, pair, lambda columns: np.column_stack(list(columns.values()))])
 def test_every_kind_of_table_gives_the_same(result: Outcome, form: Callable[[Columns], Any]) -> None:
     poses = frame(POSES) if form is frame else POSES
@@ -180,6 +181,7 @@ def test_dates_are_times(result: Outcome) -> None:
     np.testing.assert_allclose(found.values, result.values, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_earlier_result_is_a_prior_in_any_of_its_forms(result: Outcome) -> None:
     forms = [result, result.calibration, json.loads(result.to_json())]
     assert isinstance(forms[1], Calibration)
@@ -188,6 +190,7 @@ def test_an_earlier_result_is_a_prior_in_any_of_its_forms(result: Outcome) -> No
     assert one != result.to_json()
 
 
+@pytest.mark.slow
 def test_data_that_are_refused_are_no_exception() -> None:
     found = calibrate(SENSOR, REFERENCE, POSES, nominal=1.5, u_nominal_pct=1.0)
     assert found.status == "refused"
@@ -245,6 +248,7 @@ def test_what_a_notebook_shows_is_escaped_and_has_no_colours_of_its_own(result: 
     assert "background" not in result._repr_html_()
 
 
+@pytest.mark.slow
 def test_what_print_shows_fits_a_screen_and_is_what_the_command_prints(
     result: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -299,6 +303,7 @@ def test_neither_matplotlib_nor_pandas_is_needed_until_plot() -> None:
     assert run.stdout.splitlines() == ["refused True", told]
 
 
+@pytest.mark.slow
 def test_the_notebook_runs_and_its_outputs_are_those_of_a_run() -> None:
     """Without Jupyter: the code cells run in order in one name space, as docs/images/notebook_run.py does it."""
     notebook = json.loads(NOTEBOOK.read_text("utf-8"))

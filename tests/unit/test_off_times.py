@@ -28,6 +28,7 @@ def jittery(time_s: Array) -> Array:
     return time_s + np.random.default_rng(5).exponential(3e-4, len(time_s))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stamp_s",
     [
@@ -110,6 +111,7 @@ def test_two_rates_in_one_file_are_told(after: float, off_s: float) -> None:
     assert abs(told.value.row - 6000) <= 200
 
 
+@pytest.mark.slow
 def test_stalls_losses_and_a_slow_clock_are_no_other_rate() -> None:
     random = np.random.default_rng(2)
     t = np.arange(30_000) / 100.0

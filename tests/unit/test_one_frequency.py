@@ -26,6 +26,7 @@ SEEDS = range(8)
 LIMIT_Z2 = 2.0  # mean of z^2 over 8 runs of 12 parameters; 0.9 to 1.3 are found, 5 to 20 without the unknown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("motion_hz", "corner_hz", "order"), [(6.0, 31.0, 1), (3.0, 31.0, 1), (6.0, 31.0, 2)])
 def test_with_a_filter_s_is_right_at_its_frequency_and_q_is_right(
     motion_hz: float, corner_hz: float, order: int
@@ -58,6 +59,7 @@ def _u_main(lag_s: float) -> float:
     return float(found.standard_uncertainty[[0, 4, 8]].max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_known_filter_is_no_unknown_of_one_frequency(order: int) -> None:
     """First order at 31 Hz attenuates 6 Hz by 1.8 %; with the filter stated, u is hardly larger than without one."""
@@ -109,6 +111,7 @@ def in_force(seed: int) -> tuple[CalibrationUpdate, Array, Array]:
     return updates[-1], np.asarray(parameters.sensor.sensitivity) * h, np.asarray(parameters.sensor.offset)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_agent_is_right_at_that_frequency_as_well(seed: int) -> None:
     update, S, Q = in_force(seed)

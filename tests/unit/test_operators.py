@@ -70,6 +70,7 @@ def test_what_was_proposed_comes_in_force_when_it_is_accepted() -> None:
     )
 
 
+@pytest.mark.slow
 def test_what_was_proposed_waits_through_a_kill() -> None:
     site = begun(site_config())
     site.play(3)

@@ -87,6 +87,7 @@ def words(html: str) -> str:
     return " ".join(re.sub(r"<[^>]*>", " ", html).split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("heads", "stated", "unit"),
     [
@@ -139,6 +140,7 @@ def numbers(text: str, row: str, count: int) -> list[tuple[float, float]]:
     return [(float(value), float(U)) for value, U in found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("unit", "one_g"), [("g", 1.0), ("mg", 1e3)])
 def test_an_output_in_g_is_shown_in_g_per_g_and_mg(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], unit: str, one_g: float
@@ -184,6 +186,7 @@ def test_a_reference_of_acceleration_is_an_accelerometer(tmp_path: Path) -> None
     assert reference_of(certificate(tmp_path, result, output_unit="")).startswith("reference accelerometer: PCB ")
 
 
+@pytest.mark.slow
 def test_a_warning_is_told_once_wherever_the_result_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """All outputs of the sensor have the wrong sign: S is valid, and negative."""
     given = files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]"), -1.0)
@@ -213,6 +216,7 @@ def test_a_warning_is_told_once_wherever_the_result_is_read(tmp_path: Path, caps
     assert html.index("det S is negative") < html.index("<table")
 
 
+@pytest.mark.slow
 def test_a_nominal_gravity_has_the_uncertainty_of_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What gravity contributes to U of the offset is in proportion to its u, stated or by its digits."""
     given = ["calibrate", *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")), "--u-angle-deg=0.1", "--json=-"]

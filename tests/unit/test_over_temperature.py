@@ -115,6 +115,7 @@ def test_the_first_temperature_that_is_told_stays_that_of_s_and_q() -> None:
     assert pack(other.snapshot()) == pack(found.snapshot())
 
 
+@pytest.mark.slow
 def test_a_body_that_is_two_hours_behind_the_thermometer_contradicts_nothing() -> None:
     """25 K a day, and transverse sensitivities that change by 0.03 %/K."""
     world = World("", 25.0, transverse=3e-4, late_h=2.0)
@@ -125,6 +126,7 @@ def test_a_body_that_is_two_hours_behind_the_thermometer_contradicts_nothing() -
     assert np.abs(error).max() < 0.015  # three times the rotation of 0.2 deg
 
 
+@pytest.mark.slow
 def test_a_window_without_a_temperature_may_have_had_any_of_those_before() -> None:
     """A thermometer that fails after two days of 25 K, with 0.03 %/K: S stays, and U covers what it may be."""
     drawn, found = Drawn(World("", 25.0, transverse=3e-4), np.random.default_rng(5)), estimation(constant=False)

@@ -35,6 +35,7 @@ def measure(device: Device, faults: Faults, seed: int = 0, priors: Priors = PRIO
     return compare(device, runs, priors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", [PIEZO, MEMS])
 def test_without_faults_the_methods_agree_to_a_fiftieth_of_a_per_cent(device: Device) -> None:
     # Method 2 agrees on a sensor without transverse sensitivities, Methods 1 and 3 on any
@@ -65,6 +66,7 @@ ONE_U = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ONE_U)
 def test_each_contribution_is_what_the_fault_does_on_the_bench(name: str) -> None:
     assert touched(QUIET, name, ONE_U[name], PRIORS)

@@ -129,6 +129,7 @@ def test_the_date_of_a_step_is_that_of_the_dense_problem_with_the_step_in_each_g
     assert date.standard_uncertainty == pytest.approx(days.std(), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_step_within_merged_windows_is_dated_to_them_and_no_closer() -> None:
     """Four windows a day; the step is found a week later, when whole days were merged. Its share of the day's windows
     does not tell the hour, for nobody knows how they were spread."""
@@ -148,6 +149,7 @@ def test_a_step_within_merged_windows_is_dated_to_them_and_no_closer() -> None:
     assert date.standard_uncertainty == pytest.approx(0.75 / np.sqrt(12.0), rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("every", "last"), [(0.5, 19.0), (0.5, 29.5), (5.0, 40.0)])
 def test_the_date_of_a_found_drift_is_its_onset(every: float, last: float) -> None:
     """A drift by 0.3 % a day, found on day 19. A window tells S to 0.13 %, so the onset to half a day, also between two

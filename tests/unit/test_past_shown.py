@@ -65,6 +65,7 @@ def change_memory(directory: Path, change: Any) -> None:
         write_memory(connection, Memory(memory.sensor, memory.identity, memory.sequence, state))
 
 
+@pytest.mark.slow
 def test_table_csv_and_json_say_the_same(kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     past, to = shown(capsys, kept), tmp_path / "past.csv"
     assert run(capsys, "show", "--past", "--data-dir", kept, "--csv", to)[0] == 0
@@ -143,6 +144,7 @@ def test_the_date_of_a_change_is_the_same_in_table_csv_and_json(
     assert line.endswith(f"; it came {times[0]} with u = {u} d, from {times[1]} to {times[2]} (95 %)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     ending: str, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -178,6 +180,7 @@ def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     assert set(columns["calibration"].tolist()) == {0, *found.values()}
 
 
+@pytest.mark.slow
 def test_stationxml_has_the_channels_of_the_miniseed_of_the_same_recording(
     kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -347,6 +350,7 @@ def test_what_cannot_be_corrected_is_refused_with_a_remedy(
     assert "--data-dir names the windows for --corrected" in err
 
 
+@pytest.mark.slow
 def test_what_makes_u_of_any_calibration_is_told_by_store_and_recording(
     kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -66,6 +66,7 @@ def test_a_stop_that_nobody_stated_is_refused_with_the_numbers(scale: float) -> 
     assert nearest_stop(MeanOutput(scale * stops[1].gravity_mps2, NOTHING), stops, known, knowledge).pose is stops[1]
 
 
+@pytest.mark.slow
 def test_a_data_sheet_tells_stops_thirty_degrees_apart_and_never_a_wrong_one() -> None:
     """500 sensors within their data sheet, at seven distances: a likelihood ratio of 1000 may err once in 10,000."""
     random, known = np.random.default_rng(1), knowing(POOR)

@@ -39,6 +39,7 @@ def z_of(outcome: Outcome, of: Made) -> np.ndarray:
     return ((outcome.values[:9] - of.sensitivity.ravel()) / outcome.standard_uncertainty[:9])[told]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ellipse", "tones", "band"])
 @pytest.mark.parametrize("starts_and_stops", [False, True])
 def test_a_plane_tells_no_element_and_its_normal_is_named(kind: str, starts_and_stops: bool) -> None:
@@ -53,6 +54,7 @@ def test_a_plane_tells_no_element_and_its_normal_is_named(kind: str, starts_and_
         assert np.abs(outcome.more["unexcited_directions"] @ of.axes[:, 2]) == pytest.approx([1.0], abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("starts_and_stops", [False, True])
 def test_a_tone_is_told_at_its_own_frequency(starts_and_stops: bool) -> None:
     """Before, at 10 to 28 Hz, where there is noise alone."""
@@ -87,6 +89,7 @@ def test_a_weak_motion_along_the_normal_counts_where_it_is_more_than_noise(third
     assert np.abs(z_of(outcome, of)).max(initial=0.0) < 4.0
 
 
+@pytest.mark.slow
 def test_what_is_known_of_combinations_goes_into_the_next_calibration() -> None:
     """Each of two recordings in two planes determines no element; the second one with the first as prior, all."""
     first = made(World("band"), 11)
@@ -111,6 +114,7 @@ def windows_along(direction: np.ndarray, count: int, seed: int, S: np.ndarray) -
     return [replace(window, reference_noise=noise) for window in windows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", [(0.003, 1.0, -0.002), (0.6, 0.64, 0.48)])
 def test_noise_tells_nothing_of_s_across_the_motion_however_many_windows_there_are(
     direction: tuple[float, ...],
@@ -133,6 +137,7 @@ def test_noise_tells_nothing_of_s_across_the_motion_however_many_windows_there_a
     assert unknown.rank == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed", [True, False])
 def test_on_line_s_across_the_motion_stays_at_the_prior_through_days_and_a_restart(fixed: bool) -> None:
     """Noise turns the directions of each window. Before, 120 windows moved S across the motion by a third of its u.

@@ -77,6 +77,7 @@ SETS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_what_is_planned_is_what_the_agent_reaches(name: str) -> None:
     """Which parameters are determined, whether a first calibration comes of it, and U once each was taken."""
@@ -108,6 +109,7 @@ def test_six_sides_by_a_closed_formula() -> None:
     assert plan.enough
 
 
+@pytest.mark.slow
 def test_the_proposed_positions_are_enough_and_fewer_are_not() -> None:
     """For clamps of any inclination with one or two positions, as many positions as determine all twelve."""
     random = np.random.default_rng(5)
@@ -121,6 +123,7 @@ def test_the_proposed_positions_are_enough_and_fewer_are_not() -> None:
         assert not planned(configured([*poses, *(stop.columns for stop in more[:-1])]).channels[0], 1.0).enough
 
 
+@pytest.mark.slow
 def test_a_day_of_poses_is_planned_soon() -> None:
     angles = [(35.0, float(k % 360)) for k in range(20_000)]
     began_s = time.process_time()

@@ -141,6 +141,7 @@ def test_two_stops_near_each_other_are_told_apart_once_the_offset_is_known() -> 
     assert found[7].position == f"rest ({lean[0]:.6g}, 0, {lean[2]:.6g})"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window_s", [14.0, 16.6, 17.5, 19.0])
 def test_no_window_reaches_into_a_turning_wherever_it_would_end(window_s: float) -> None:
     found = windows(turned(FACES), configured(window_s=window_s))

@@ -191,6 +191,7 @@ def test_what_a_dying_router_did_not_take_stays_in_the_outbox(site: Site, store:
     site.restart()
 
 
+@pytest.mark.slow
 def test_close_does_not_wait_for_a_long_backlog(store: Store, publisher: Publisher) -> None:
     store.commit([record(n) for n in range(1, 50_001)])
     publisher.start()

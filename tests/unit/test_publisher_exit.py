@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import zenoh
 
 from agent.delivery.session import session_config
@@ -60,6 +61,7 @@ def test_the_interpreter_exits_though_the_publisher_was_never_closed(site: Site,
     assert "RuntimeError: an agent that fails" in faults
 
 
+@pytest.mark.slow
 def test_close_is_bounded_while_a_frozen_router_holds_a_put_up(tmp_path: Path) -> None:
     router = router_process("--listen", "tcp/127.0.0.1:0")
     assert router.stdout is not None

@@ -102,6 +102,7 @@ def written(tmp_path: Path, text: str | bytes, name: str = "file.csv") -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SENSORS)
 def test_sensors(kind: str, tmp_path: Path) -> None:
     found = read_sensor(written(tmp_path, SENSORS[kind]))

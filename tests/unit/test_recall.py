@@ -50,6 +50,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_a_corrected_result_is_that_of_the_same_data_with_the_new_certificate(recorded: Path, tmp_path: Path) -> None:
     before = (recorded / FILE_NAME).read_bytes()
     new, out = toml(tmp_path / "new.toml", **NEW), tmp_path / "out"
@@ -84,6 +85,7 @@ def test_a_recording_and_a_data_directory_have_the_same_results_and_each_is_corr
     assert "not empty" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_thousand_results_take_seconds_and_each_file_is_signed(recorded: Path, tmp_path: Path) -> None:
     update = calibrations_of(recorded)[-1]
     many = [msgspec.structs.replace(update, run_id="many", sequence=k) for k in range(1, 1001)]

@@ -138,6 +138,7 @@ def test_a_state_that_is_newer_than_the_recordings_stays(tmp_path: Path) -> None
     again.close()
 
 
+@pytest.mark.slow
 def test_wherever_a_recording_is_torn_the_state_is_that_of_the_last_result_in_it(tmp_path: Path) -> None:
     recorded(tmp_path, ())
     ((_, path),) = recordings(tmp_path)

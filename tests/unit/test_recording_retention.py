@@ -89,6 +89,7 @@ def test_without_limits_everything_stays(directory: Path) -> None:
     assert due(directory, KeepFiles()) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", range(1, FILES + 1))
 @pytest.mark.parametrize("more", [-1, 0, 1])
 def test_bytes_are_kept_to_by_the_oldest_files(directory: Path, count: int, more: int) -> None:
@@ -218,6 +219,7 @@ def test_deleting_that_cannot_reach_the_limit_deletes_nothing(
     assert disk.retention.notice == ""
 
 
+@pytest.mark.slow
 def test_a_lack_of_space_must_last_and_then_one_goes_at_a_time(
     directory: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -333,6 +335,7 @@ def test_numbers_go_on_though_every_file_is_gone(tmp_path: Path) -> None:
             path.unlink()
 
 
+@pytest.mark.slow
 def test_a_disk_that_fails_is_asked_less_and_less_often(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "gone", [], [], retry_s=10.0)
     now_s, waits = 0, []

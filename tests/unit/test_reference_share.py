@@ -64,6 +64,7 @@ def test_a_corrected_state_is_that_of_the_same_data_with_the_other_certificate(s
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), u_expected, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_the_difference_of_two_children_of_one_reference_has_the_u_that_is_stated() -> None:
     random, parts = np.random.default_rng(SEED), {"shared": [], "alone": []}
     for _ in range(REFERENCES):

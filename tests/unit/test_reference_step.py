@@ -71,6 +71,7 @@ def u_of(found: Estimation) -> np.ndarray:
     return found.in_force.standard_uncertainty
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("step", "true"), [({"reference_error": ALONG_Y}, 0.0), ({"S": S_TRUE * (1 + ALONG_Y)}, STEP)])
 def test_after_a_step_of_reference_or_sensor_u_covers_both_and_stays(step: dict[str, Any], true: float) -> None:
     found = stepped(beside(), **step)
@@ -84,21 +85,25 @@ def test_after_a_step_of_reference_or_sensor_u_covers_both_and_stays(step: dict[
     assert u_of(found)[SYY] == pytest.approx(u, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_small_step_is_as_uncertain_as_the_reference_is_stable() -> None:
     found = stepped(beside(stability_pct=2.5), reference_error=ALONG_Y)
     assert u_of(found)[SYY] == pytest.approx(0.025 * S_TRUE[1, 1], rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_reference_that_does_not_drift_made_no_step() -> None:
     assert u_of(stepped(beside(stability_pct=0.0), reference_error=ALONG_Y))[SYY] < 2e-3
 
 
+@pytest.mark.slow
 def test_a_turn_of_the_sensor_is_no_step_of_the_reference() -> None:
     turn = np.eye(3) + 0.02 * np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     found = stepped(beside(), S=S_TRUE @ turn)
     assert u_of(found)[[0, 4, 8]].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_another_reference_tells() -> None:
     found = beside()
     found.meet("A", "", 1.0)
@@ -108,6 +113,7 @@ def test_another_reference_tells() -> None:
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1]) < 3 * u_of(found)[SYY] < 6e-3
 
 
+@pytest.mark.slow
 def test_on_a_turning_mount_gravity_tells_that_it_was_the_reference() -> None:
     random, found = np.random.default_rng(3), on_the_clamp()
 
@@ -133,6 +139,7 @@ def shown_by(window: Window, error: float) -> Window:
     return replace(window, sums=replace(sums, mean=sums.mean @ felt, scatter=felt @ sums.scatter @ felt))
 
 
+@pytest.mark.slow
 def test_nothing_is_forgotten_in_a_snapshot() -> None:
     found = stepped(beside(), reference_error=ALONG_Y)
     again = beside()

@@ -44,6 +44,7 @@ def recorded(seed: int, u_pct: float) -> tuple[Outcome, np.ndarray]:
     return calibrate((t, V), reference, rotation=np.eye(3), **stated), S
 
 
+@pytest.mark.slow
 def test_u_of_s_has_the_transverse_sensitivities_of_the_reference() -> None:
     square = []
     for seed in range(SEEDS):
@@ -78,6 +79,7 @@ def test_what_a_reference_shows_of_other_axes_is_taken_out_of_its_motion() -> No
     assert np.allclose(physics.felt_motion(across, np.eye(3)) @ indicated, motion, rtol=0.0, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swapped", [False, True])
 def test_on_line_they_stay_with_their_reference(swapped: bool) -> None:
     """Two references tell more than one: of each the error is its own."""

@@ -93,6 +93,7 @@ def ran(tmp_path: Path, channels: list[str], bug: str, times: int, duration_s: f
     return fieldcal("run", path, "--data-dir", tmp_path / "data", "--duration", str(duration_s))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plug_in")
 def test_run_ends_with_2_where_no_channel_can_work(tmp_path: Path) -> None:
     done = ran(tmp_path, ["imu"], "the adapter refuses", times=10**9, duration_s=50)
@@ -103,6 +104,7 @@ def test_run_ends_with_2_where_no_channel_can_work(tmp_path: Path) -> None:
     assert fieldcal("audit", file).returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plug_in")
 def test_the_others_go_on_where_a_channel_can_work(tmp_path: Path) -> None:
     done = ran(tmp_path, ["imu", "good"], "the adapter refuses", times=10**9, duration_s=4)
@@ -114,6 +116,7 @@ def test_the_others_go_on_where_a_channel_can_work(tmp_path: Path) -> None:
     assert opened == ["good"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plug_in")
 def test_an_adapter_that_refuses_what_it_took_before_does_not_end_the_run(tmp_path: Path) -> None:
     done = ran(tmp_path, ["imu"], "the adapter refuses later", times=1, duration_s=8)
@@ -137,6 +140,7 @@ def bus(adapter: Adapter) -> I2CBus:
     return I2CBus({0x53: twin}, adapter=adapter)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("adapters", "status"),
     [([TOO_SHORT], 2), ([TOO_SHORT, TOO_SHORT], 2), ([TOO_SHORT, BCM2835], 0), ([BCM2835, SMBUS_ONLY], 0)],

@@ -43,6 +43,7 @@ def ends(data: bytes, path: Path) -> list[int]:
         return [record.end for record in walk(file, len(data))]
 
 
+@pytest.mark.slow
 def test_cut_anywhere_it_is_closed_and_loses_no_byte(whole: bytes, tmp_path: Path) -> None:
     record_ends = ends(whole, tmp_path / "whole")
     sizes = sorted({*range(0, len(whole), 211), *record_ends, *(end - 1 for end in record_ends), len(whole) - 3})

@@ -107,6 +107,7 @@ def check_alone(seen: Page) -> None:
     assert sum(map(len, ids)) == len(set().union(*ids))
 
 
+@pytest.mark.slow
 def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     directory, truth = recorded
     assert run(capsys, directory, "-o", tmp_path / "out") == (0, "")
@@ -133,6 +134,7 @@ def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: 
     assert [len(f["sha256"]) for f in held["files"]] == [64]
 
 
+@pytest.mark.slow
 def test_a_recording_gives_the_same_calibration_and_a_torn_one_what_it_has(
     recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,6 +171,7 @@ def test_a_recording_without_a_calibration_says_why_and_is_status_3(
     check_figures(tmp_path / "out", "windows")
 
 
+@pytest.mark.slow
 def test_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     diagonal = [[10.1, None, None], [None, 9.8, None], [None, None, 10.3]]
     flags = {"sensitivity": np.eye(3, dtype=bool).tolist(), "offset": [False] * 3}
@@ -234,6 +237,7 @@ def test_a_result_of_files_is_shown_with_their_samples_as_long_as_they_are_the_s
     assert "poses.csv has changed since the calibration" in held["notices"][0]
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "r.json", method="1")
     for name in ("a", "b"):

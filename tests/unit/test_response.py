@@ -51,6 +51,7 @@ def errors(made: Pair, found: Outcome) -> tuple[np.ndarray, np.ndarray]:  # type
     return found.calibration.sensitivity - made.sensitivity, found.calibration.standard_uncertainty[:9].reshape(3, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALIKE)
 def test_s_is_right_at_its_frequency(name: str) -> None:
     made = pair(1, ALIKE[name])
@@ -87,6 +88,7 @@ def test_a_constant_s_would_be_wrong() -> None:
     assert np.abs(np.diag(found.sensitivity - made.sensitivity)).min() > 0.01
 
 
+@pytest.mark.slow
 def test_u_covers_with_the_error_of_the_reference() -> None:
     """20 runs over six filters; n is 20, because the nine elements share the reference's error."""
     random, inside = np.random.default_rng(7), 0
@@ -116,6 +118,7 @@ def test_the_response_is_told_as_it_is() -> None:
     assert abs(away) < 4.0 * at_0hz["standard_uncertainty"][0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "response",
     [lowpass(2, 7.0), lowpass(4, 10.0), lowpass(4, 8.0), resonance(7.0, 10.0), resonance(10.5, 30.0), highpass(0.2)],
@@ -129,11 +132,13 @@ def test_near_a_corner_or_a_resonance_s_is_right_or_refused(response: Filter) ->
         assert np.abs(error / u).max() < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("response", [lowpass(4, 8.0), resonance(7.0, 10.0), highpass(0.2)])
 def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
     assert not_limited(pair(3, response)).reasons
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 4, 17])
 def test_a_resonance_of_the_reference_within_slow_motion_is_refused(seed: int) -> None:
     """Once a response is taken out, less than four thirds of an octave move: no band was seen any more, S was told as a
@@ -142,6 +147,7 @@ def test_a_resonance_of_the_reference_within_slow_motion_is_refused(seed: int) -
     assert not_limited(made, reference=1e-3).calibration is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 @pytest.mark.parametrize("seed", [1, 5])
 def test_a_resonance_at_one_and_a_half_times_slow_motion(side: str, seed: int) -> None:
@@ -154,6 +160,7 @@ def test_a_resonance_at_one_and_a_half_times_slow_motion(side: str, seed: int) -
     assert np.abs(error / u).max() < 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 @pytest.mark.parametrize("order", [1, 2])
 def test_an_unknown_corner_at_a_fifth_of_slow_motion(order: int, side: str) -> None:
@@ -199,6 +206,7 @@ def test_an_ac_coupled_reference_needs_no_option_but_its_coupling(tmp_path: Path
     assert np.abs(off).max() < 5e-4
 
 
+@pytest.mark.slow
 def test_a_few_points_by_chance_are_no_result() -> None:
     """In all but ten seconds the sensor does not follow: the wire of the reference was loose."""
     made = pair(0, flat, seconds=300.0)
@@ -315,6 +323,7 @@ def test_short_stops_beside_an_ac_coupled_reference_settle(seed: int) -> None:
     assert np.abs((found.sensitivity - seen.truth.sensitivity).ravel() / found.standard_uncertainty[:9]).max() < 3.0
 
 
+@pytest.mark.slow
 def test_what_is_refused_tells_its_response_band_by_band() -> None:
     """A resonance within the motion: no S, but each band tells its own sensitivity, right within its uncertainty."""
     shape = resonance(14.0, 5.0)

@@ -69,6 +69,7 @@ def deviation_pct(one: CalibrationUpdate, other: Array) -> float:
     return float(100.0 * np.abs(np.array(one.sensitivity) - other).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in FILTERS if name != "flat"])
 def test_a_filter_changes_neither_s_at_its_frequency_nor_q(name):
     found, without = told(name), told("flat")
@@ -102,6 +103,7 @@ def test_the_response_is_told_by_frequency(name):
         assert (np.diag(band.standard_uncertainty) < 0.0025).all()  # a filter changes these by up to 8 %
 
 
+@pytest.mark.slow
 def test_s_means_the_same_when_the_motion_becomes_wider():
     name = "low-pass of order 1, 31 Hz"
     drawn, calm = filtered(FILTERS[name], Band(0.5, 6.0))
@@ -115,6 +117,7 @@ def test_s_means_the_same_when_the_motion_becomes_wider():
     assert deviation_pct(found, np.array(without.sensitivity) * size(name, found)) < SAME_PCT
 
 
+@pytest.mark.slow
 def test_windows_at_one_frequency_before_count_as_what_they_are():
     """A first window at 3 Hz knows S there; the response came later."""
     name = "low-pass of order 1, 31 Hz"
@@ -128,6 +131,7 @@ def test_windows_at_one_frequency_before_count_as_what_they_are():
     assert deviation_pct(found, np.array(without.sensitivity) * size(name, found)) < 2.0 * SAME_PCT
 
 
+@pytest.mark.slow
 def test_beside_an_ac_coupled_reference_the_response_is_told_as_beside_another_one():
     """The corner is stated as it is. What the filters do was told as another corner, by 12 of its uncertainties."""
     corner_hz, found, states = 0.05, {}, {}
@@ -153,6 +157,7 @@ def test_beside_an_ac_coupled_reference_the_response_is_told_as_beside_another_o
     assert len(found["ac"].response) == len(found["dc"].response)
 
 
+@pytest.mark.slow
 def test_a_restored_state_goes_on_bit_for_bit():
     drawn, building = filtered(FILTERS["moving mean of 16 ms"])
     events = list(visits(building, range(5)))

@@ -54,6 +54,7 @@ def records(pose: Pose) -> list[Record]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POSES)
 def test_derivatives_are_those_of_what_is_predicted(name: str) -> None:
     own, random = records(POSES[name]), np.random.default_rng(3)

@@ -77,6 +77,7 @@ def test_white_noise_of_the_reference_is_as_dense_in_a_narrower_band() -> None:
 ORDERS = ["W...", ".W..", "WWW.", "BBB", ".BB"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ORDERS)
 def test_u_is_at_its_bound_whichever_windows_have_faster_motion(order: str) -> None:
     state = after([window(10 + k, kind) for k, kind in enumerate(order)])
@@ -167,6 +168,7 @@ def test_a_stated_band_is_used_from_the_first_window_on_and_can_be_stated_later(
         assert judged(found)[0] < 1.05
 
 
+@pytest.mark.slow
 def test_lorries_in_the_first_window_do_not_matter_on_line() -> None:
     """With the band of the first window for life, u was 1.26 times the bound with these samples."""
     found = lorries.one(("the first", lorries.SEED + 2))

@@ -54,6 +54,7 @@ def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
         assert fleet.step(T_NS + DAY_NS) > 0
 
 
+@pytest.mark.slow
 def test_every_result_arrives_once_in_order_and_signed_and_forged_ones_are_refused(site: Site, tmp_path: Path) -> None:
     with (
         SimulatedFleet(4, 1, 1, [site.endpoint], tmp_path) as fleet,
@@ -108,6 +109,7 @@ def told(behaviour: Behaviour) -> tuple[list[Result], dict[str, Any]]:
     return results, sensor.truth()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("behaviour", "statuses"),
     [("sound", SOUND), ("drifting", SOUND), ("stepped", [*SOUND, "HELD", "RECALIBRATING"]), ("held", [*SOUND, "HELD"]),
@@ -126,6 +128,7 @@ def test_statuses_are_those_of_the_agent_and_a_held_sensor_puts_nothing_in_force
     assert truth["begun"] == (behaviour != "sound")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("behaviour", "verdict"), [("drifting", "drifting"), ("stepped", "stepped"), ("held", "stepped")]
 )
@@ -137,6 +140,7 @@ def test_the_parameter_that_changes_is_found(behaviour: Behaviour, verdict: str)
     assert truth["since_utc_ns"] == T_NS + 10 * BEGINS[behaviour] * DAY_NS
 
 
+@pytest.mark.slow
 def test_a_mount_that_leans_is_named_with_its_angle() -> None:
     results, truth = told("leaning")
     reasons = " ".join(r.reason for r in results if isinstance(r, StatusChange))
@@ -190,6 +194,7 @@ def test_the_odd_gateways_are_drawn_by_the_seed() -> None:
     assert behaviours(1, 1) == ["drifting"]
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_the_command_in_order(site: Site, tmp_path: Path) -> None:
     told = [sys.executable, "-c", COMMAND, "simulate", "--fleet", "5", "--sensors", "1", "--every", "0.2",
             "--connect", site.endpoint, "--keys", str(tmp_path / "known")]  # fmt: skip
@@ -220,6 +225,7 @@ def test_an_invalid_endpoint_is_bad_input() -> None:
     assert (done.return_value, "not an endpoint" in done.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_a_fleet_in_several_processes_is_the_same_fleet(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -257,6 +263,7 @@ def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: P
         assert sorted(times.values()) == [k * 100_000_000 for k in range(5)]
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_is_told(site: Site, tmp_path: Path) -> None:
     with FleetProcesses(2, 1, 1, [site.endpoint], tmp_path) as fleet:
         os.kill(fleet.pids()[0], signal.SIGKILL)

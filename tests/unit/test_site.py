@@ -59,6 +59,7 @@ def small() -> SimulatedSite:
     return site
 
 
+@pytest.mark.slow
 def test_sparse_adjustment_is_the_dense_one_of_all_samples(small: SimulatedSite) -> None:
     sparse, batch = adjusted(small), dense(small)
     assert set(sparse.leaves) == {"s0", "s2", "s3"}
@@ -161,6 +162,7 @@ def test_a_sensor_that_is_wrong_as_a_reference_is_named() -> None:
     assert bad.is_reference
 
 
+@pytest.mark.slow
 def test_a_sound_site_names_nobody_and_statistics_are_chi_squared() -> None:
     """Of 4 references of a sound site, over 8 sites: the mean statistic is within 4 SD of the degrees of freedom."""
     statistics: list[float] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -71,22 +73,30 @@ def errors_over_u(found: Adjustment) -> Array:
     return np.asarray(error / calibration.standard_uncertainty)
 
 
-def mean_square(jitter_s: float) -> Array:
+def drawn(jitter_s: float) -> list[Adjustment]:
     rng = np.random.default_rng(SEED)
-    return np.asarray(
-        np.mean([errors_over_u(adjust(windows(rng, jitter_s), PRIORS)) ** 2 for _ in range(DRAWS)], axis=0)
-    )
+    return [adjust(windows(rng, jitter_s), PRIORS) for _ in range(DRAWS)]
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 20e-6, 100e-6])
+as_they_are = cache(drawn)
+
+
+def mean_square(found: list[Adjustment]) -> Array:
+    return np.asarray(np.mean([errors_over_u(each) ** 2 for each in found], axis=0))
+
+
+@pytest.mark.slow
+@pytest.mark.one_case
+@pytest.mark.parametrize("jitter_s", [100e-6, 20e-6, 0.0])
 def test_s_and_q_are_as_uncertain_as_said(jitter_s: float) -> None:
     highest = chi2_quantile(1.0 - 1e-3 / 12 / 3, DRAWS) / DRAWS  # 99.9 %, Bonferroni over 12 parameters and 3 sizes
-    assert mean_square(jitter_s).max() < highest
+    assert mean_square(as_they_are(jitter_s)).max() < highest
 
 
+@pytest.mark.slow
 def test_weighed_as_exact_they_would_not_be(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adjustment, "SCATTER_TURNS", 0)
-    assert mean_square(100e-6).max() > 4.0
+    assert mean_square(drawn(100e-6)).max() > 4.0
 
 
 def test_loadings_are_the_size_of_motion_and_its_rate_over_the_noise() -> None:
@@ -112,11 +122,11 @@ def test_the_scatter_of_lags_is_what_residuals_show_beyond_noise() -> None:
     np.testing.assert_allclose(found.lag_s, np.sqrt((40 * 18.0 - 30 * 2.0) / (30 * 2.0**2)), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_scatter_found_is_that_put_in() -> None:
-    rng = np.random.default_rng(SEED)
-    found = [adjust(windows(rng, 100e-6), PRIORS).lag_scatter_s for _ in range(DRAWS)]
+    found = [each.lag_scatter_s for each in as_they_are(100e-6)]
     assert np.median(found) == pytest.approx(100e-6, rel=0.2)
-    assert adjust(windows(rng, 0.0), PRIORS).lag_scatter_s < 10e-6
+    assert adjust(windows(np.random.default_rng(SEED), 0.0), PRIORS).lag_scatter_s < 10e-6
 
 
 def test_a_stated_scatter_that_is_larger_counts() -> None:

@@ -33,6 +33,7 @@ def test_zeros_take_little_room() -> None:
     assert len(pack({"a": np.ones(1000)})) < 8060
 
 
+@pytest.mark.slow
 def test_samples_of_a_dead_device_do_not_make_a_snapshot_unreadable() -> None:
     samples = np.zeros((6_000_000, 3))
     assert unpack(pack({"sensor": samples}))["sensor"].shape == samples.shape

@@ -126,6 +126,7 @@ def of_year(*, fixed: bool) -> State:
     return state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_squares_add_up_to_the_variances(fixed: bool) -> None:
     state = of_year(fixed=fixed)
@@ -162,6 +163,7 @@ def test_rests_alone_and_merged_records_have_budgets_as_well(clamped: list[Recor
         np.testing.assert_allclose(total, whole.now.variance[:12], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_first_calibration_of_a_day_and_an_adopted_jump_have_a_budget() -> None:
     """Also after a restart in between; the squares are those of U in force."""
     random = np.random.default_rng(14)

@@ -47,6 +47,7 @@ def test_looking_at_some_rows_needs_no_memory_for_the_others() -> None:
     assert peak < 15e6
 
 
+@pytest.mark.slow
 def test_the_file_goes_with_its_last_user() -> None:
     gc.collect()  # files that other tests left to the collector
     before = open_files()

@@ -64,6 +64,7 @@ def test_vibration_is_no_turn(frequency_hz: float, phase: float) -> None:
     assert end is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", np.linspace(0.0, np.pi, 5))
 @pytest.mark.parametrize("frequency_hz", [0.17, 0.2, 0.3])
 def test_slow_motion_is_no_turn(frequency_hz: float, phase: float) -> None:

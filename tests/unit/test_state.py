@@ -37,6 +37,7 @@ def values(calibration: Calibration) -> np.ndarray:
     return np.append(calibration.sensitivity.ravel(), calibration.offset)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_on_a_clamp_it_gives_what_all_windows_at_once_give(seed: int) -> None:
     random = np.random.default_rng(seed)
@@ -73,6 +74,7 @@ def test_with_exact_angles_it_is_the_least_squares_of_all_points() -> None:
     np.testing.assert_allclose(found.result().offset, plain[3], rtol=0, atol=5e-4)
 
 
+@pytest.mark.slow
 def test_the_stated_uncertainty_covers() -> None:
     covered, runs = np.zeros(12), 80
     for seed in range(runs):
@@ -124,6 +126,7 @@ def test_motion_that_goes_along_is_none_of_the_excited_column() -> None:
     np.testing.assert_allclose(found.result().sensitivity[:, 0], MEAN[[0, 3, 6]], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_mean_that_drifts_at_a_fixed_mount_moves_the_offset_alone() -> None:
     wander = replace(Wander.none(), offset_mps2=0.01, offset_rate_mps2=1e-3, offset_rate_walk_mps2=1e-5)
     random, found = np.random.default_rng(3), mounted(wander=wander)
@@ -139,6 +142,7 @@ def test_a_mean_that_drifts_at_a_fixed_mount_moves_the_offset_alone() -> None:
     assert now.standard_uncertainty[9] > 0.9 * U[2] * G_MPS2
 
 
+@pytest.mark.slow
 def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better() -> None:
     random, found = np.random.default_rng(4), mounted(replace(FIXED, reference=1e-3))
     smallest = np.inf

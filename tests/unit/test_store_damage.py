@@ -48,6 +48,7 @@ def bits() -> list[tuple[int, int]]:
     return chance.sample(header, FLIPS) + [(-1 - chance.randrange(40_000), chance.randrange(8)) for _ in range(FLIPS)]
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_is_found_or_harmless(sound: Path, tmp_path: Path) -> None:
     whole, expected = sound.read_bytes(), said(sound)
     found = 0

@@ -78,6 +78,7 @@ def test_the_newest_of_each_kind_and_device_stay_however_old(tmp_path: Path) -> 
     again.close()
 
 
+@pytest.mark.slow
 def test_a_size_is_kept_to_over_ten_times_as_much(tmp_path: Path) -> None:
     size = 200_000
     store = filled(tmp_path, KeepResults(bytes=size))

@@ -49,6 +49,7 @@ def told(results: list[Result]) -> list[tuple[float, str]]:
     return [((change.t_utc_ns - EPOCH_NS) * 1e-9, change.reason) for change in changes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("coarse", "change", "since_s", "words"),
     [
@@ -84,6 +85,7 @@ def test_all_outputs_are_told() -> None:
     assert max(at_s for at_s, _ in found) < SINCE_S + 120.0
 
 
+@pytest.mark.slow
 def test_a_sound_coarse_sensor_is_not_called_stuck() -> None:
     results = recording(coarse=True).through_agent()
     assert told(results) == []

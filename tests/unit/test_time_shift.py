@@ -94,6 +94,7 @@ def off_u(drawn: Node, results: list[Result]) -> float:
     return float(np.max(np.abs(error) / update.standard_uncertainty))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("device", "shift_s", "said"),
     [
@@ -117,6 +118,7 @@ def test_stamps_that_shift_are_found_and_told_and_every_window_is_taken(
     assert off_u(drawn, results) < 3.5  # 12 errors: beyond 3.5 u in one of 180 runs
 
 
+@pytest.mark.slow
 def test_a_shift_beyond_what_is_stated_stays_held_and_says_what_to_state() -> None:
     drawn = site()
     beyond_s = 4.0 * U_LAG_S + 0.01 - drawn.building.parameters.lag_s
@@ -130,6 +132,7 @@ def test_a_shift_beyond_what_is_stated_stays_held_and_says_what_to_state() -> No
     assert statuses[-1].status == "HELD" or "uncertainty.lag_s" in statuses[-1].reason
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_sensitivity_is_no_shift_and_no_other_lag_is_tried(made: Counter[int]) -> None:
     drawn = site(harm=Transformed("3 % more", "sensor", 1.03 * np.eye(3)))
     results = fed(drawn, visits(drawn.building, range(WINDOWS)))
@@ -138,6 +141,7 @@ def test_a_jump_of_the_sensitivity_is_no_shift_and_no_other_lag_is_tried(made: C
     assert [made[visit] for visit in range(FROM, FROM + 4)] == [1] * 4
 
 
+@pytest.mark.slow
 def test_a_lag_that_was_excluded_is_seldom_tried_again_but_another_one_at_once(made: Counter[int]) -> None:
     drawn = site()
     beyond_s = 4.0 * U_LAG_S + 0.01 - drawn.building.parameters.lag_s
@@ -150,6 +154,7 @@ def test_a_lag_that_was_excluded_is_seldom_tried_again_but_another_one_at_once(m
     assert tried == [True, True, False, True, True]  # at one lag the first, the second and the fourth; then another
 
 
+@pytest.mark.slow
 def test_a_device_that_began_anew_is_named() -> None:
     drawn = site()
     results = fed(drawn, shifted(drawn, "reference", 0.015, BlockFlags.RESTART))
@@ -158,6 +163,7 @@ def test_a_device_that_began_anew_is_named() -> None:
     assert "(restarted: reference)" in told
 
 
+@pytest.mark.slow
 def test_a_device_that_is_opened_again_may_be_late_by_another_time_as_far_as_stated() -> None:
     drawn = site()
     since_ns = round(drawn.building.span(FROM)[0] * 1e9)
@@ -172,6 +178,7 @@ def test_a_device_that_is_opened_again_may_be_late_by_another_time_as_far_as_sta
     assert not news(results)
 
 
+@pytest.mark.slow
 def test_a_pipeline_restored_in_the_middle_of_it_goes_on_bit_for_bit() -> None:
     drawn = site()
     run, other = Run(drawn.config), Run(drawn.config)

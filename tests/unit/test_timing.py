@@ -199,6 +199,7 @@ def test_a_rate_that_cannot_be_is_refused() -> None:
         ClockModel(0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon_s", [10.0, 1e6])
 @pytest.mark.parametrize("asked_each", [1, 7, 1000])
 def test_it_does_not_matter_how_often_the_clock_is_asked(asked_each: int, horizon_s: float) -> None:

@@ -141,6 +141,7 @@ def damaged(frames: list[bytes], k: int, kind: str) -> Iterator[bytes]:
             yield from (whole[:i] + bytes([octet]) + whole[i:] for octet in (0x80, 0x0D, 0, 255, whole[i]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["cut", "lost", "added"])
 @pytest.mark.parametrize("changes", [CLOSED, COUNTED, CLOSED | COUNTED])
 def test_the_way_is_found_within_two_frames(changes: dict[str, Any], kind: str) -> None:
@@ -194,6 +195,7 @@ def test_each_sample_has_the_arrival_of_its_own_last_byte() -> None:
     assert arrivals == {k: 1000 + k for k in range(1, 59)}
 
 
+@pytest.mark.slow
 @given(st.lists(st.one_of(st.binary(max_size=12), st.sampled_from([b"\x80abcde\r" * 9, b"\x80\r"])), max_size=12),
        st.lists(st.integers(0, 300), max_size=5), st.sampled_from([b"", b"\r"]))  # fmt: skip
 def test_a_stream_cut_anywhere_gives_the_same_frames(parts: list[bytes], cuts: list[int], end: bytes) -> None:

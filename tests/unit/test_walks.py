@@ -87,6 +87,7 @@ def test_another_reference_tells_who_has_drifted_if_it_was_there_for_three_quart
     raise AssertionError("nothing was told")
 
 
+@pytest.mark.slow
 def test_walks_as_they_are_stated_are_told_at_most_as_often_as_the_formula_says() -> None:
     """3 lives of 8 years at 2 false alarms a year: 48 by the formula, an upper bound. The spans that are kept, and
     daily looks, leave at least a third; 99.9 % of Poisson counts of 16 to 48 are 5 to 73."""
@@ -166,6 +167,7 @@ def life_of(rate_pct: float, days: int) -> Life:
     return lived(stated, np.arange(float(days)), 1, lambda day: np.diag([1.0, 1.0 + a_day * day, 1.0]), none, none, 12)
 
 
+@pytest.mark.slow
 def test_a_drift_of_ten_per_cent_a_year_is_told_within_a_month_and_u_covers_it() -> None:
     life = life_of(10.0, 40)
     assert life.told_of("Syy") <= 31
@@ -174,6 +176,7 @@ def test_a_drift_of_ten_per_cent_a_year_is_told_within_a_month_and_u_covers_it()
     assert {v.parameter for _, v in life.told} == {"Syy"}
 
 
+@pytest.mark.slow
 def test_a_step_of_a_reference_within_the_u_of_its_certificate_makes_u_grow() -> None:
     days = np.append(np.arange(12.0), 12.0 + 0.25 * np.arange(8))
     life = lived(
@@ -189,6 +192,7 @@ def test_a_step_of_a_reference_within_the_u_of_its_certificate_makes_u_grow() ->
     assert np.abs(life.errors / life.u)[:, SYY].max() < 2.0
 
 
+@pytest.mark.slow
 def test_an_estimation_goes_on_from_its_snapshot_bit_for_bit() -> None:
     days = np.arange(16.0)
     found, again = (Drawn(channel(WALK_PCT, STABILITY_PCT), None) for _ in range(2))

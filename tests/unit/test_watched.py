@@ -74,6 +74,7 @@ def run(config: Config, blocks: list[SampleBlock]) -> tuple[Site, list[Result]]:
     return site, site.results
 
 
+@pytest.mark.slow
 def test_the_calibration_that_was_made_beside_a_reference_stays_in_force() -> None:
     beside = begun(site_config(certificate={"u_sensitivity_pct": 0.5, "quantity": "acceleration"}))
     made = updates(beside.play(6))[-1]
@@ -114,6 +115,7 @@ def test_a_stated_calibration_is_in_force_from_the_start_and_its_u_grows_with_it
     assert block.covariance == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_calibration_is_told_once_a_day_with_the_u_that_it_has_then() -> None:
     world = World(t_s=20.0)
     blocks = [world.block(1800.0) for _ in range(2 * 50)]
@@ -162,6 +164,7 @@ def test_without_any_calibration_the_sensor_is_watched_in_the_unit_of_the_prior(
     assert {r.calibration_sequence for r in hours(results)} == {0}
 
 
+@pytest.mark.slow
 def test_an_hour_tells_mean_noise_power_and_temperature() -> None:
     world = World(seed=3)
     degrees = [20.0 + 0.01 * k for k in range(1000)]
@@ -207,6 +210,7 @@ def test_missing_clipped_and_stuck_samples_are_counted_and_their_minutes_left_ou
     assert np.abs(np.array(told.mean_mps2) - GRAVITY).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_an_output_that_is_stuck_is_counted_and_gives_no_numbers() -> None:
     world = World(t_s=0.0, rate_hz=50.0)
     blocks = [world.block(4.0) for _ in range(200)]
@@ -225,6 +229,7 @@ def test_silence_ends_an_hour_and_says_nothing_more() -> None:
     assert said(site.results)[-1][0] == "INVALID"
 
 
+@pytest.mark.slow
 def test_utc_that_steps_back_a_little_opens_no_hour_twice_and_a_wrong_year_does_not_stop_the_hours() -> None:
     world = World(t_s=0.0)
     blocks = [world.block() for _ in range(600)]
@@ -255,6 +260,7 @@ def events_of_two_hours() -> list[Event]:
     return found
 
 
+@pytest.mark.slow
 def test_a_pipeline_restored_at_any_event_goes_on_bit_for_bit() -> None:
     config = watched_config(prior=PRIOR)
     site = Site(config)
