@@ -79,7 +79,7 @@ def test_right_signs_are_not_refused():
     assert refused == [()] * 50
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_swapped_axes_contradict_the_nominal():
     windows = clamp_points(np.random.default_rng(7), ORDINARY, S=S_TRUE[[1, 0, 2]]).windows
     assert "Sxx is 0.01" in _only_reason(adjust(windows, _nominal())) or "expected" in _only_reason(
@@ -159,7 +159,7 @@ def _reference_times(windows: list[Window], factor: float) -> list[Window]:
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("factor", [2.0, 0.8, 1.2])
 def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(factor):
     windows = _reference_times(clamp_points(np.random.default_rng(20), ORDINARY).windows, factor)

@@ -65,7 +65,7 @@ def test_it_is_a_filter_whatever_the_length(n: int) -> None:
     assert np.isfinite(shown[half:-half]).all()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_lag_is_found_under_the_noise_of_the_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Rms 0.02 m/s2 and noise 0.006: in all of its band the reference's derivative is noise, 3 ms then cost 0.6 %."""
     up = np.array([0.0, 0.0, 9.80665])

@@ -186,7 +186,7 @@ def rounded(path: Path, step_s: float, share: float) -> None:
     path.write_text("\n".join([head, *(f"{t:.6f},{p[1]}" for t, p in zip(stamps, parts, strict=True))]) + "\n")
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("rate_hz", [50.0, 125.0, 200.0, 1000.0])
 def test_stamps_of_which_some_are_rounded(rate_hz: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     p = plain(7)

@@ -36,7 +36,7 @@ def told(path: Path) -> object:
     return json.loads((path / "certificate.json").read_text())["certificate"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_options_state_what_a_file_states(capsys: pytest.CaptureFixture[str], tmp_path: Path, result: Path) -> None:
     stated = [word for name, value in entries().items() for word in ("--state", f"{name}={value}")]
     assert run(capsys, result, *stated, "-o", tmp_path / "options") == (0, "")

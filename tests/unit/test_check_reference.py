@@ -105,7 +105,7 @@ def test_each_reference_has_its_own_unknowns_and_priors() -> None:
     assert 0.998 * with_both < 100 * found.in_force.standard_uncertainty[SYY] / S_TRUE[1, 1] < with_first
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("which", "device", "other"), [("first", "r", "c"), ("second", "c", "r")])
 def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, device: str, other: str) -> None:
     found, control = sound(estimation()), sound(estimation())
@@ -123,7 +123,7 @@ def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, d
     assert abs(found.in_force.sensitivity[1, 1] - before.sensitivity[1, 1]) < 0.5 * u[SYY]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_reference_that_is_stated_not_to_drift_is_named_too() -> None:
     results = judged(sound(estimation(stability_pct=0.0)), 101, 12, 24, STEPPED["first"])
     assert "the reference r has changed by y +" in adopted(results)
@@ -176,7 +176,7 @@ def test_sound_windows_of_the_other_reference_do_not_dismiss_held_ones() -> None
     assert "the reference r has changed by y +" in adopted(results)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_nothing_is_named_while_nothing_changes() -> None:
     assert set(actions(judged(estimation(), 108, 0, 32))) == {"take"}
 

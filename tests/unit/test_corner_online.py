@@ -39,7 +39,7 @@ def errors(recording: Recording, **sections: Any) -> np.ndarray:
     return recording.errors_over_u(found.sensitivity, found.covariance, found.determined)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("bench", [True, False], ids=["bench", "building"])
 @pytest.mark.parametrize("of", ["reference", "sensor"])
 def test_a_corner_as_uncertain_as_stated_calibrates(of: str, bench: bool) -> None:
@@ -53,7 +53,7 @@ def test_a_corner_as_uncertain_as_stated_calibrates(of: str, bench: bool) -> Non
 
 # Of a sensor's corner what is left is second order: the product of the corner and of how far it is off, over the square
 # of the frequency at which S holds: 0.05 % here.
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("of", "apart"), [("reference", 0.1), ("sensor", 0.6)])
 def test_the_result_is_that_of_instruments_without_a_corner(of: str, apart: float) -> None:
     with_corner = errors(Recording(4, drawn(4, of), bench=False), **SECTIONS[of])
@@ -98,7 +98,7 @@ def beside_an_mcc172(hz: float, corner_hz: float, *, stated: bool) -> tuple[np.n
     return main / np.diag(recording.S) - 1.0, U / main
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("hz", "low"), [(1.6, 0.101), (3.2, 0.028)])
 def test_what_the_driver_mcc172_states_is_undone(hz: float, low: float) -> None:
     error, U = beside_an_mcc172(hz, 0.78, stated=False)
@@ -116,7 +116,7 @@ def test_what_the_driver_mcc172_states_agrees_with_both_figures_of_the_data_shee
     assert -0.1 < at_5_2_hz < -0.09
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("corner_hz", [0.1, 0.5, 1.0])
 def test_a_coupling_whose_corner_the_driver_does_not_know_is_in_u(corner_hz: float) -> None:
     options = NiOptions.model_validate({"channels": ["cDAQ1Mod1/ai0"], "iepe_ma": 2.0})

@@ -60,7 +60,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(ROOT, tmp_path_factory.mktemp("deb"), 0o022)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_another_path_gives_the_same_bytes(package: Path, tmp_path: Path) -> None:
     """Other are the checkout, the directory for scratch files, the umask, and the path of the Python that installed."""
     checkout = tmp_path / "another path" / "checkout"

@@ -20,7 +20,7 @@ CASES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("case", CASES)
 def test_s_is_right_within_its_uncertainty(case: str, tmp_path: Path) -> None:
     errors = []
@@ -38,7 +38,7 @@ def test_s_is_right_within_its_uncertainty(case: str, tmp_path: Path) -> None:
     assert np.nanmax(np.abs(errors)) < 3.5
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_motion_that_the_noise_hides_is_refused_with_the_reason(tmp_path: Path) -> None:
     small = replace(GNSS, band_hz=(0.5, 4.0), level_mps2=0.01)
     recording = Recording(0, small, bench=True, stand_s=60.0)

@@ -33,7 +33,7 @@ def upper_half(frequency_hz: np.ndarray) -> np.ndarray:  # type: ignore[type-arg
     return np.where(frequency_hz > 10.0, DENSITY, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("disturbed", "times"),
     [
@@ -63,7 +63,7 @@ def test_a_disturbance_costs_its_band(disturbed: Disturbance, times: float) -> N
     assert np.abs(error / u).max() < 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_another_response_is_not_taken_for_noise() -> None:
     """A resonance within the motion contradicts one S: it is named, not filtered away."""
     of = pair(3, resonance(8.0, 8.0), band_hz=BAND_HZ, rate_hz=200.0, seconds=300.0)

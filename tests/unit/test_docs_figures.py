@@ -140,7 +140,7 @@ def test_what_the_guide_says_beforehand() -> None:
         assert_same(line_of("guided", line[: line.index("|", 2) + 1]), line)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_the_best_test_of_a_site_reaches() -> None:
     for line in site.bounds():
         assert_same(line_of("site-runs", line[: line.rindex("|", 0, -1)]), line)
@@ -186,7 +186,7 @@ def figures(name: str, begin: str) -> list[list[float]]:
     return [[float(number) for number in NUMBER.findall(cell)] for cell in line.split(" | ")[1:]]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("row", ["sensor lags by 5 ms", "offset differs by 0.05", "all together"])
 def test_plain_method_3_against_the_adjustment(row: str) -> None:
     number = next(k for k, each in enumerate(torture.ROWS) if each.name.startswith(row))
@@ -200,7 +200,7 @@ def test_plain_method_3_against_the_adjustment(row: str) -> None:
         assert_rms(adjusted[k], scale * column)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_noisy_reference_on_a_structure() -> None:
     found = [torture_shm.one(seed) for seed in range(1)]
     naive, errors, u, _ = (np.array(each) for each in zip(*found, strict=True))
@@ -211,7 +211,7 @@ def test_a_noisy_reference_on_a_structure() -> None:
     assert_rms(float(np.mean(rms)), 100.0 * errors.ravel())
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("line", [0, 2])
 def test_one_frequency(line: int) -> None:
     motion_hz, corner_hz, order = one_frequency.LINES[line]

@@ -44,7 +44,7 @@ class Feed:
         return self
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("threshold", [7.0, 9.0])
 def test_false_alarms_are_as_many_as_the_formula_says(threshold: float) -> None:
     """1.2 million windows: at threshold 9 expect 120 alarms, one standard deviation 9 %; a threshold off by 0.3 shows.

@@ -70,7 +70,7 @@ def same(one: list[CalibrationUpdate], other: list[CalibrationUpdate]) -> bool:
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("backwards", [False, True])
 def test_what_drivers_state_counts_as_if_the_configuration_stated_it(*, backwards: bool) -> None:
     config = drawn().config
@@ -131,7 +131,7 @@ def calibrated(path: Path, *options: str) -> list[list[float]]:
     return json.loads(out.read_text())["sensitivity"]  # type: ignore[no-any-return]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     coupled = {**STATED, "reference": ("flat", "highpass corner_hz=0.01 u_corner_pct=30")}
     with_it, without = recorded(tmp_path / "a", coupled), recorded(tmp_path / "b", STATED)

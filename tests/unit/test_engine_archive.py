@@ -125,7 +125,7 @@ def test_archive_holds_all_and_audits_by_sh_alone(
 BASE = f"python/lib/{PYTHON}/os.py"
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("part", "content", "told"),
     [

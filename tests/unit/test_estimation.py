@@ -239,7 +239,7 @@ def test_a_snapshot_in_the_midst_of_a_jump_goes_on_bit_for_bit() -> None:
     assert pack(other.snapshot()) == pack(going_on.snapshot())
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("a_day", "most"),
     [

@@ -52,7 +52,7 @@ def after(found: Estimation, windows: list[Any]) -> list[str]:
     return actions(hours(found, windows, first=BEFORE + HELD))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_another_range_is_named_at_once_and_both_that_is_advised_ends_it() -> None:
     doubled = Exchange(2.0 * EYE)
     found, told = held(Exchange(1.5 * EYE), *[doubled] * HELD)  # the first window saw both ranges
@@ -125,7 +125,7 @@ def test_what_is_no_exchange_is_not_called_one(matrix: Array) -> None:
     assert explained(again(before()), np.random.default_rng(7), Exchange(matrix), count=2) == []
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("cause", "words", "not_advised"),
     [

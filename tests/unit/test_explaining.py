@@ -42,7 +42,7 @@ def statuses(harm: Harm, seed: int = 1) -> list[StatusChange]:
     return [r for r in results if isinstance(r, StatusChange)]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("harm", "best", "size", "remedy"),
     [
@@ -70,7 +70,7 @@ def test_the_status_says_what_explains_the_held_windows_best(harm: Harm, best: s
     assert remedy in told.reason
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_mount_that_leans_is_named_for_as_long_as_its_windows_are_held() -> None:
     """A window every nine days. The more the state may have wandered since its last window, the less chi-squared has
     beyond chance; in the end the held windows contradict nothing, but would change Q by more than is allowed. With a
@@ -95,7 +95,7 @@ def test_either_of_two_that_fit_alike_is_named() -> None:
     assert "another sensitivity (Syy +7" in told.reason
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("response", "change"), [(lowpass(1, 25.0), "smaller"), (resonance(25.0, 10.0), "larger")])
 def test_another_filter_is_named_with_its_frequency(response: Filter, change: str) -> None:
     """At 12.8 Hz the low-pass filter of 25 Hz lets 0.890 pass, the resonance 1.355."""

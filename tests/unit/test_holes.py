@@ -85,7 +85,7 @@ def test_the_filtered_samples_are_those_without_loss(lost: str) -> None:
     assert 0.3 < np.mean(excess) < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("lost", ["", "sensor", "reference"])
 def test_the_sensitivity_scatters_as_the_real_samples_tell(lost: str) -> None:
     """Forty seeds of nine coefficients: errors over u from the independent points, rms within chi2's 99.9 %."""

@@ -333,7 +333,7 @@ def damage(text: bytes, rng: np.random.Generator) -> bytes:
             return before + text[place + piece :]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("sequence", [True, False])
 def test_a_hundred_thousand_damaged_bursts(sequence: bool) -> None:
     # 50 000 each: no exception, only finite numbers, increasing indices, nothing is held back, most lines are decoded.

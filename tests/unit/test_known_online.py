@@ -60,7 +60,7 @@ def test_a_near_filter_that_is_stated_changes_neither_s_nor_q(where: str) -> Non
     assert np.abs(np.array(found.offset) - without.offset).max() < 0.006
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("stated", [True, False])
 def test_a_filter_that_was_set_otherwise_is_a_changed_response_and_no_drift(*, stated: bool) -> None:
     """The sensor's output rate is doubled between two runs. If nobody states that, its windows are held."""

@@ -57,7 +57,7 @@ def of_bands(of: Pair) -> LeftOpen:
     return bands.left_open
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("of_reference", [True, False])
 def test_noise_alike_in_all_bands_may_be_the_references(of_reference: bool) -> None:
     """1 % of the motion's power: S is up to 1 % too small. Before, S was off by 9.6 u of 0.1 %."""
@@ -168,7 +168,7 @@ def test_sums_add_and_are_kept() -> None:
     assert LeftOpen().by_axis(np.ones(5), np.zeros(5)) == (0.0, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("disturbed", "source", "least"),
     [(within(0.01, of_reference=True), "whose noise it is", 0.004), (undisturbed, "response by axis", 5e-4)],

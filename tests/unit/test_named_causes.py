@@ -296,7 +296,7 @@ def test_times_in_ms_are_named_for_the_table_that_has_them() -> None:
     right(of_twenty_seconds())
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("channel", "times"), [(0, 0.0), (1, 1.0 / 30.0), (2, 0.0)])
 def test_a_dead_channel_of_the_reference_is_named_and_no_output_called_dead(channel: int, times: float) -> None:
     sensor, (t, a) = triad()
@@ -340,7 +340,7 @@ MIXED = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", MIXED)
 def test_exchanged_and_inverted_outputs_are_named_where_a_nominal_is_stated(name: str) -> None:
     place, *told = MIXED[name]
@@ -357,7 +357,7 @@ def test_a_nominal_sensitivity_per_g_is_named() -> None:
     assert "all main sensitivities are about 0.102 times what was expected: the prior is per g; convert it" in reason
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_self_test_that_was_left_on_for_some_windows_is_named() -> None:
     (t, V), reference, poses = clamped()
     on = V.copy()
@@ -368,7 +368,7 @@ def test_a_self_test_that_was_left_on_for_some_windows_is_named() -> None:
     right(calibrate((t, on), reference, poses[4:]))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_self_test_that_was_on_all_the_time_contradicts_what_was_known() -> None:
     (t, V), reference, poses = clamped()
     known = calibrate((t, V), reference, poses)

@@ -34,7 +34,7 @@ def relative(made: Pair, response: Filter, found: Outcome) -> tuple[float, float
     return float(np.abs(np.diag(away)).max()), float(np.nanmax(np.abs(away.ravel()) / found.expanded_uncertainty[:9]))
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("response", "skirts"),
     [(lowpass(2, 1.56 * TO_HZ), 2), (resonance(3.0 * TO_HZ, 5.0), 4)],
@@ -53,7 +53,7 @@ def test_motion_that_reaches_into_a_filter_is_used_below_it(response: Filter, sk
     assert TO_HZ < high_hz < 3.0 * TO_HZ
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_resonance_that_hides_the_motion_in_all_windows() -> None:
     """Q 50 at 1.5 times the upper end: no window follows the reference, unless it is limited."""
     response = resonance(1.5 * TO_HZ, 50.0)

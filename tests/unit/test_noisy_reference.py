@@ -48,7 +48,7 @@ def test_a_band_with_noise_alone_is_no_motion() -> None:
     assert band_hz[1] < 22.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_noise_of_a_slow_reference_that_grows_with_frequency() -> None:
     """3 % of the motion in the middle of its band. Before, all were refused. Of 54 elements all but a sixth are within
     2 u (of a perfect estimator more are beyond in one of 7000 cases), and none is beyond 4 u."""

@@ -59,7 +59,7 @@ def test_q_of_a_drifting_sensor_is_that_in_the_middle_and_its_u_covers_both_ends
     assert np.median(u) == pytest.approx(DRIFT_MPS2 / np.sqrt(2.0), rel=0.15)  # from the middle to one end
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_scatter_alone_shows_no_drift() -> None:
     """One meeting in a hundred may show one: of 150 these are 1.5, and more than 5 have a probability of 0.4 %."""
     u = np.array([np.sqrt(np.mean(u_of(met(seed, 0.0)[0])[9:] ** 2)) for seed in range(1000, 1150)])

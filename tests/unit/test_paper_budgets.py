@@ -35,7 +35,7 @@ def measure(device: Device, faults: Faults, seed: int = 0, priors: Priors = PRIO
     return compare(device, runs, priors)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("device", [PIEZO, MEMS])
 def test_without_faults_the_methods_agree_to_a_fiftieth_of_a_per_cent(device: Device) -> None:
     # Method 2 agrees on a sensor without transverse sensitivities, Methods 1 and 3 on any

@@ -144,7 +144,7 @@ def test_the_date_of_a_change_is_the_same_in_table_csv_and_json(
     assert line.endswith(f"; it came {times[0]} with u = {u} d, from {times[1]} to {times[2]} (95 %)")
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     ending: str, kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

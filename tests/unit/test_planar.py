@@ -114,7 +114,7 @@ def windows_along(direction: np.ndarray, count: int, seed: int, S: np.ndarray) -
     return [replace(window, reference_noise=noise) for window in windows]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("direction", [(0.003, 1.0, -0.002), (0.6, 0.64, 0.48)])
 def test_noise_tells_nothing_of_s_across_the_motion_however_many_windows_there_are(
     direction: tuple[float, ...],
@@ -137,7 +137,7 @@ def test_noise_tells_nothing_of_s_across_the_motion_however_many_windows_there_a
     assert unknown.rank == 2
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("fixed", [True, False])
 def test_on_line_s_across_the_motion_stays_at_the_prior_through_days_and_a_restart(fixed: bool) -> None:
     """Noise turns the directions of each window. Before, 120 windows moved S across the motion by a third of its u.

@@ -77,7 +77,7 @@ SETS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", SETS)
 def test_what_is_planned_is_what_the_agent_reaches(name: str) -> None:
     """Which parameters are determined, whether a first calibration comes of it, and U once each was taken."""

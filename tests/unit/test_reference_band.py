@@ -17,7 +17,7 @@ CASES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("quantity", CASES)
 def test_motion_above_the_band_of_the_reference_does_not_count(quantity: str, tmp_path: Path) -> None:
     errors = []

@@ -71,7 +71,7 @@ def u_of(found: Estimation) -> np.ndarray:
     return found.in_force.standard_uncertainty
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("step", "true"), [({"reference_error": ALONG_Y}, 0.0), ({"S": S_TRUE * (1 + ALONG_Y)}, STEP)])
 def test_after_a_step_of_reference_or_sensor_u_covers_both_and_stays(step: dict[str, Any], true: float) -> None:
     found = stepped(beside(), **step)
@@ -113,7 +113,7 @@ def test_another_reference_tells() -> None:
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1]) < 3 * u_of(found)[SYY] < 6e-3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_on_a_turning_mount_gravity_tells_that_it_was_the_reference() -> None:
     random, found = np.random.default_rng(3), on_the_clamp()
 

@@ -79,7 +79,7 @@ def test_what_a_reference_shows_of_other_axes_is_taken_out_of_its_motion() -> No
     assert np.allclose(physics.felt_motion(across, np.eye(3)) @ indicated, motion, rtol=0.0, atol=1e-15)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("swapped", [False, True])
 def test_on_line_they_stay_with_their_reference(swapped: bool) -> None:
     """Two references tell more than one: of each the error is its own."""

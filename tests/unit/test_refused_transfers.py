@@ -140,7 +140,7 @@ def bus(adapter: Adapter) -> I2CBus:
     return I2CBus({0x53: twin}, adapter=adapter)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("adapters", "status"),
     [([TOO_SHORT], 2), ([TOO_SHORT, TOO_SHORT], 2), ([TOO_SHORT, BCM2835], 0), ([BCM2835, SMBUS_ONLY], 0)],

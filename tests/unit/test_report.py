@@ -107,7 +107,7 @@ def check_alone(seen: Page) -> None:
     assert sum(map(len, ids)) == len(set().union(*ids))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     directory, truth = recorded
     assert run(capsys, directory, "-o", tmp_path / "out") == (0, "")
@@ -171,7 +171,7 @@ def test_a_recording_without_a_calibration_says_why_and_is_status_3(
     check_figures(tmp_path / "out", "windows")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_methods_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     diagonal = [[10.1, None, None], [None, 9.8, None], [None, None, 10.3]]
     flags = {"sensitivity": np.eye(3, dtype=bool).tolist(), "offset": [False] * 3}

@@ -118,7 +118,7 @@ def test_the_response_is_told_as_it_is() -> None:
     assert abs(away) < 4.0 * at_0hz["standard_uncertainty"][0, 0]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "response",
     [lowpass(2, 7.0), lowpass(4, 10.0), lowpass(4, 8.0), resonance(7.0, 10.0), resonance(10.5, 30.0), highpass(0.2)],
@@ -132,13 +132,13 @@ def test_near_a_corner_or_a_resonance_s_is_right_or_refused(response: Filter) ->
         assert np.abs(error / u).max() < 4.0
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("response", [lowpass(4, 8.0), resonance(7.0, 10.0), highpass(0.2)])
 def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
     assert not_limited(pair(3, response)).reasons
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("seed", [2, 3, 4, 17])
 def test_a_resonance_of_the_reference_within_slow_motion_is_refused(seed: int) -> None:
     """Once a response is taken out, less than four thirds of an octave move: no band was seen any more, S was told as a
@@ -147,7 +147,7 @@ def test_a_resonance_of_the_reference_within_slow_motion_is_refused(seed: int) -
     assert not_limited(made, reference=1e-3).calibration is None
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 @pytest.mark.parametrize("seed", [1, 5])
 def test_a_resonance_at_one_and_a_half_times_slow_motion(side: str, seed: int) -> None:
@@ -323,7 +323,7 @@ def test_short_stops_beside_an_ac_coupled_reference_settle(seed: int) -> None:
     assert np.abs((found.sensitivity - seen.truth.sensitivity).ravel() / found.standard_uncertainty[:9]).max() < 3.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_is_refused_tells_its_response_band_by_band() -> None:
     """A resonance within the motion: no S, but each band tells its own sensitivity, right within its uncertainty."""
     shape = resonance(14.0, 5.0)

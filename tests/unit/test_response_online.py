@@ -69,7 +69,7 @@ def deviation_pct(one: CalibrationUpdate, other: Array) -> float:
     return float(100.0 * np.abs(np.array(one.sensitivity) - other).max())
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", [name for name in FILTERS if name != "flat"])
 def test_a_filter_changes_neither_s_at_its_frequency_nor_q(name):
     found, without = told(name), told("flat")

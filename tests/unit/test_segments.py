@@ -39,7 +39,7 @@ def of_ten_minutes() -> Outcome:
     return calibrated(SensorTable("sensor", time_s, V), reference, poses, Options())
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_calibration_hardly_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     """1180 segments, and a sixth of them, as of a day."""
     as_they_are = of_ten_minutes()

@@ -55,7 +55,7 @@ class Shaken(Recording):
         return blocks
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("lost", [0, 40])
 def test_a_sensor_beside_it_is_calibrated(lost: int) -> None:
     recording = Shaken(5, Devices(derivatives=1, reference_noise=1e-6), bench=False)

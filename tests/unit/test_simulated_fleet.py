@@ -109,7 +109,7 @@ def told(behaviour: Behaviour) -> tuple[list[Result], dict[str, Any]]:
     return results, sensor.truth()
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("behaviour", "statuses"),
     [("sound", SOUND), ("drifting", SOUND), ("stepped", [*SOUND, "HELD", "RECALIBRATING"]), ("held", [*SOUND, "HELD"]),
@@ -128,7 +128,7 @@ def test_statuses_are_those_of_the_agent_and_a_held_sensor_puts_nothing_in_force
     assert truth["begun"] == (behaviour != "sound")
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("behaviour", "verdict"), [("drifting", "drifting"), ("stepped", "stepped"), ("held", "stepped")]
 )
@@ -140,7 +140,7 @@ def test_the_parameter_that_changes_is_found(behaviour: Behaviour, verdict: str)
     assert truth["since_utc_ns"] == T_NS + 10 * BEGINS[behaviour] * DAY_NS
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_mount_that_leans_is_named_with_its_angle() -> None:
     results, truth = told("leaning")
     reasons = " ".join(r.reason for r in results if isinstance(r, StatusChange))

@@ -242,7 +242,7 @@ def test_outside_the_temperatures_of_the_norm_u_grows(learned: tuple[Site, SiteW
     assert u[1] > 2.0 * u[0]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_sound_sites_are_left_alone() -> None:
     """16 sites of 9 sensors for 50 days each after the learning: 0.5 alarms a site and year are 1.1; with 99.5 % at
     most 4."""

@@ -126,7 +126,7 @@ def of_year(*, fixed: bool) -> State:
     return state
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_squares_add_up_to_the_variances(fixed: bool) -> None:
     state = of_year(fixed=fixed)

@@ -49,7 +49,7 @@ def told(results: list[Result]) -> list[tuple[float, str]]:
     return [((change.t_utc_ns - EPOCH_NS) * 1e-9, change.reason) for change in changes]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("coarse", "change", "since_s", "words"),
     [

@@ -94,7 +94,7 @@ def off_u(drawn: Node, results: list[Result]) -> float:
     return float(np.max(np.abs(error) / update.standard_uncertainty))
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("device", "shift_s", "said"),
     [

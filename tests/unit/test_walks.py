@@ -167,7 +167,7 @@ def life_of(rate_pct: float, days: int) -> Life:
     return lived(stated, np.arange(float(days)), 1, lambda day: np.diag([1.0, 1.0 + a_day * day, 1.0]), none, none, 12)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_drift_of_ten_per_cent_a_year_is_told_within_a_month_and_u_covers_it() -> None:
     life = life_of(10.0, 40)
     assert life.told_of("Syy") <= 31
