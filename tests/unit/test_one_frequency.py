@@ -26,7 +26,7 @@ SEEDS = range(8)
 LIMIT_Z2 = 2.0  # mean of z^2 over 8 runs of 12 parameters; 0.9 to 1.3 are found, 5 to 20 without the unknown
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("motion_hz", "corner_hz", "order"), [(6.0, 31.0, 1), (3.0, 31.0, 1), (6.0, 31.0, 2)])
 def test_with_a_filter_s_is_right_at_its_frequency_and_q_is_right(
     motion_hz: float, corner_hz: float, order: int
