@@ -22,7 +22,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from calib.model import Array
-from calib.site.day import Hours
+from calib.site_watch.day import Hours
 
 BANDS_HZ = 10.0 ** (np.arange(0, 14) / 10.0)  # 1 Hz to 20 Hz
 FREQUENCY_HZ = np.array([1.12, 1.66, 2.45, 3.3, 4.3, 5.7, 7.3, 9.2, 11.8, 15.2])

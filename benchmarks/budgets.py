@@ -21,8 +21,8 @@ import numpy as np
 from benchmarks.dates import MEAN, U, window
 from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.state.state import State
 
 COUNTS, REPEATS = (50, 100, 300), 5
 PRIORS = Priors(reference=1e-3, rotation_rad=3e-3, offset_mps2=0.01)

@@ -20,13 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from calib.estimate.dating import Date
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.statements import Step
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Array, Pose
+from calib.state.dating import Date
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.drawn_records import UP, Truth, template, told
 
 DAYS = np.arange(0.0, 40.0, 0.25)

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.estimate.false_alarms import false_alarm_rate, false_alarm_threshold
-from calib.estimate.onsets import CLIP, FEWEST, SPAN, Onsets
+from calib.drift.false_alarms import false_alarm_rate, false_alarm_threshold
+from calib.drift.onsets import CLIP, FEWEST, SPAN, Onsets
 from calib.model import PARAMETERS, Array
 
 WINDOWS_A_YEAR = 8766.0
@@ -44,7 +44,7 @@ def false_alarms(threshold: float, windows: int, series: int = 1000) -> int:
 
 
 class Glr:
-    """The test of calib.estimate.onsets with the threshold of the product."""
+    """The test of calib.drift.onsets with the threshold of the product."""
 
     def __init__(self) -> None:
         self._onsets, self._k = Onsets(SERIES), 0

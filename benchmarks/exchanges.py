@@ -22,9 +22,9 @@ import numpy as np
 from agent.core.estimation import Estimation
 from agent.core.exchanges import Exchange, exchanged
 from benchmarks.page import machine, write_part
-from calib.estimate.record import Record
 from calib.geometry import STANDARD_GRAVITY_MPS2 as G
 from calib.model import Array, Window
+from calib.windows.record import Record
 from hw.virtual.schedule import rotation
 from tests.building_windows import building_window
 from tests.clamp_windows import S_TRUE

@@ -24,12 +24,12 @@ import numpy as np
 from agent.bench.session import Session
 from agent.bench.stops import Stop, on_clamp, turned_by_hand
 from benchmarks.page import machine, write_part
-from calib.estimate.next_stop import MAIN, Expected, Wanted
 from calib.estimate.nuisances import Priors
-from calib.estimate.stop_order import Together
-from calib.excitation.sums import window_sums
 from calib.geometry import STANDARD_GRAVITY_MPS2, clamp
 from calib.model import Window
+from calib.visit.next_stop import MAIN, Expected, Wanted
+from calib.visit.stop_order import Together
+from calib.windows.sums import window_sums
 
 ALPHAS_DEG = tuple(range(0, 360, 15))
 FREQUENCY_HZ, AMPLITUDE_MPS2, RATE_HZ, STAY_S, NOISE_MPS2 = 3.0, 10.0, 200.0, 10.0, 0.02

@@ -26,9 +26,9 @@ from agent.core.hypotheses import Devices, confirmed, shape_of_change
 from benchmarks.page import machine, write_part
 from calib.distributions import chi2_quantile
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.state.state import State
+from calib.windows.record import Record
 from hw.virtual.schedule import rotation
 from tests.building_windows import building_window
 

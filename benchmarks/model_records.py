@@ -13,10 +13,10 @@ import numpy as np
 
 from calib.estimate.estimate import Estimate
 from calib.estimate.physics import Stack, Windows
-from calib.estimate.record import Record
 from calib.estimate.statements import Statements
 from calib.estimate.unknowns import Unknowns
 from calib.model import Array
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.drawn_records import scatter
 

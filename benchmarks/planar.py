@@ -19,10 +19,10 @@ from dataclasses import replace
 import numpy as np
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Window
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.planar_world import U_REFERENCE, U_ROTATION, World, calibrated, made, orthonormal
 
 WORLDS = {

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from calib.estimate.deviations import U_CORNER
 from calib.estimate.nuisances import Priors
 from calib.model import Array
 from calib.recorded.adjusting import adjusted
 from calib.signal.known_response import UNKNOWN, known_of
+from calib.windows.deviations import U_CORNER
 from tests.pair import (
     NOTHING,
     Filter,

@@ -24,12 +24,12 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from calib.estimate.contradiction import FALSE_ALARM, suspects, verdicts
-from calib.estimate.device import Device
-from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Priors
-from calib.estimate.site import Site
 from calib.model import Pose, Window, WindowSums
+from calib.site_adjustment.contradiction import FALSE_ALARM, suspects, verdicts
+from calib.site_adjustment.device import Device
+from calib.site_adjustment.link import Link, link
+from calib.site_adjustment.site import Site
 from tests.dense_site import RATE_HZ, SAMPLES, SimulatedSite, Stated, turned
 
 NOMINAL = np.append(np.eye(3).ravel(), np.zeros(3))

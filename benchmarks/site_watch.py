@@ -29,9 +29,9 @@ import numpy as np
 from benchmarks.beam_world import BANDS_HZ, FREQUENCY_HZ, Bridge, Damage, World, changed, turned
 from benchmarks.page import machine, write_part
 from calib.model import Array
-from calib.site.day import Hours, day_of
-from calib.site.verdicts import Result, result
-from calib.site.watch import SiteWatch
+from calib.site_watch.day import Hours, day_of
+from calib.site_watch.verdicts import Result, result
+from calib.site_watch.watch import SiteWatch
 
 GATEWAYS = {8: 3, 30: 5, 200: 10}
 LEARNED_DAYS = 240

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.page import machine, write_part
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
-from calib.excitation.sums import window_sums
 from calib.geometry import clamp
 from calib.model import Array, Window
+from calib.windows.sums import window_sums
 
 RATE_HZ = 1000.0
 SAMPLES = 2_000_000  # for the sums

@@ -23,11 +23,11 @@ from benchmarks.model_records import drawn, smoothed, templates
 from benchmarks.page import machine, write_part
 from calib.estimate.estimate import Estimate, estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
 from calib.estimate.statements import Statements, Step
-from calib.estimate.thinning import thinned
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
+from calib.state.thinning import thinned
+from calib.windows.record import Record
 from tests.clamp_windows import G_MPS2
 
 YEARS, YEAR_DAYS, EVERY_DAYS, MERGED_DAYS = 10, 365.0, 2.0, 10.0

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.estimate.adjustment import Adjustment, adjust
+from calib.adjustment.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Applied, Priors
-from calib.excitation.sums import window_sums
 from calib.excitation.windows import Points, judged
 from calib.geometry import clamp
 from calib.model import Pose, Window, WindowSums
@@ -14,6 +13,7 @@ from calib.paper.method3 import fit
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.resampling import differentiate, resample
 from calib.signal.stamps import clock_from_stamps
+from calib.windows.sums import window_sums
 from hw.virtual.bench import Recording
 from hw.virtual.schedule import PoseInterval
 

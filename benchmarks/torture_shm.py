@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.page import machine, write_part
 from benchmarks.torture_rows import FIXED, Q_TRUE, S_TRUE
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.excitation.front_end import Settings, windows_of
 from calib.excitation.pieces import pieces_of
 from calib.geometry import beside

@@ -32,7 +32,7 @@ from agent.calibrate.stated import options_of
 from agent.cli.led import parsed
 from agent.config import Channel, parse_config
 from benchmarks.page import machine, write_part
-from calib.estimate.next_stop import MAIN, Wanted
+from calib.visit.next_stop import MAIN, Wanted
 from hw.virtual.visits import RATE_HZ, REFERENCE, Clamped, Structure, StructureParameters
 
 SENSOR = "sensor-1"

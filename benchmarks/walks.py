@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from agent.config import Channel
 from agent.config.knowledge import Certificate, Process
 from agent.core.estimation import Estimation
-from calib.estimate.drift import DriftVerdict
+from calib.drift.drift import DriftVerdict
 from calib.estimate.quantities import YEAR_DAYS
-from calib.estimate.record import Record
-from calib.estimate.walks import LONGEST_DAYS, Shown, Walks
 from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.state.walks import LONGEST_DAYS, Shown, Walks
+from calib.windows.record import Record
 from tests.building_windows import building_window
 
 Array = NDArray[np.float64]

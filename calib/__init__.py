@@ -8,9 +8,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib.estimate.adjustment import adjust
+    from calib.adjustment.adjustment import adjust
+    from calib.adjustment.norm_fit import norm_fit
     from calib.estimate.correction import corrected
-    from calib.estimate.norm_fit import norm_fit
     from calib.estimate.nuisances import Priors
     from calib.excitation.front_end import windows_of
     from calib.excitation.windows import rests_anywhere
@@ -54,9 +54,9 @@ __all__ = [
 ]
 
 _PLACES = {
-    "calib.estimate.adjustment": ("adjust",),
+    "calib.adjustment.adjustment": ("adjust",),
     "calib.estimate.correction": ("corrected",),
-    "calib.estimate.norm_fit": ("norm_fit",),
+    "calib.adjustment.norm_fit": ("norm_fit",),
     "calib.estimate.nuisances": ("Priors",),
     "calib.excitation.front_end": ("windows_of",),
     "calib.excitation.windows": ("rests_anywhere",),

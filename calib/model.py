@@ -30,7 +30,7 @@ class Pose:
     does not measure gravity, NaN if it does but the gravity is not known; the mean of such a window is not used.
     `theta_rad`, `alpha_rad` are the angles of the clamp (Eqs. 9-11), None without a clamp. `u_alpha_rad`, `u_theta_rad`
     are the standard uncertainties of angles that were found from data; 0 for stated angles. `along` (m, m) is given
-    when some channels were not excited by themselves (calib.excitation.excited): the motion is then
+    when some channels were not excited by themselves (calib.windows.excited): the motion is then
     `direction @ (along @ u + along_rate_s @ du/dt)`, and the columns of those channels are zero in both matrices.
     """
 
@@ -66,7 +66,7 @@ class WindowSums:
     Columns of z, q = 2 m + 3: the reference's m channels u, their m time derivatives du/dt, then V_x, V_y, V_z.
     `reference_channels` is m; `count` (K,) the number of samples of each segment; `mean` (K, q);
     `scatter` (K, q, q) = sum (z - mean)(z - mean)'. The sums are centred, so that no digits are lost to cancellation.
-    Segments are merged by the formula of Chan, Golub and LeVeque (calib.excitation.sums).
+    Segments are merged by the formula of Chan, Golub and LeVeque (calib.windows.sums).
     """
 
     reference_channels: int
@@ -77,7 +77,7 @@ class WindowSums:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandSums:
-    """Sums of products of a window in B bands of frequency (calib.excitation.bands).
+    """Sums of products of a window in B bands of frequency (calib.windows.bands).
 
     `reference_channels` is m, integrals included. `low_hz`, `high_hz` (B,) are the limits of the bands, `points` (B,)
     the numbers of points in them, of which the share `independent` is statistically independent. `products`

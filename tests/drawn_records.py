@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.estimate.record import Record
-from calib.estimate.type_a import LEVELS, SUMS
 from calib.model import Pose, Window
+from calib.windows.record import Record
+from calib.windows.type_a import LEVELS, SUMS
 from hw.virtual.schedule import rotation
 from tests.clamp_windows import G_MPS2, sums_of
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.estimate.clamping import Clamping
+from calib.visit.clamping import Clamping
 
 AXES = "xyz"
 ALONG = 0.9  # share of a rotation about one axis by which it is called one about that axis

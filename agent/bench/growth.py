@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from agent.config import Channel
-from calib.estimate.next_stop import COVERAGE_FACTOR
 from calib.estimate.quantities import YEAR_DAYS
 from calib.model import Array, scale_of
+from calib.visit.next_stop import COVERAGE_FACTOR
 
 MONTHS = (0, 1, 3, 6, 12)
 MONTH_DAYS = YEAR_DAYS / 12.0

@@ -12,10 +12,10 @@ import numpy as np
 from agent.bench.capture import DeviceSamples
 from agent.bench.stops import Stop
 from agent.config import Channel
-from calib.estimate.adjustment import adjust
-from calib.estimate.lag_search import without_lag
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Applied, Priors
 from calib.excitation.front_end import Settings, most_margin_s
+from calib.excitation.lag_search import without_lag
 from calib.excitation.window_verdict import Limits
 from calib.model import Array, Window
 from calib.recorded.adjusting import adjusted, over_frequency, with_response

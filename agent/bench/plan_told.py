@@ -15,7 +15,7 @@ from agent.config import Channel, Config
 from agent.config.names import Told
 from agent.setup.contradictions import contradictions, nominal_of
 from agent.setup.device_checks import loaded_options
-from calib.estimate.next_stop import MAIN
+from calib.visit.next_stop import MAIN
 from hw.sensor import Options
 
 DIRECTION = ("dx", "dy", "dz")  # columns of poses.csv

@@ -1,6 +1,6 @@
 """What the stated positions of a channel will tell, before they are taken: which of the 12 parameters, and to what U.
 
-Computed as `fieldcal bench` plans its stops (calib.estimate.next_stop), for the motion that it begins with. Whether a
+Computed as `fieldcal bench` plans its stops (calib.visit.next_stop), for the motion that it begins with. Whether a
 first calibration comes of it is decided as the agent's gate decides it.
 """
 
@@ -17,10 +17,10 @@ from agent.config import Channel
 from agent.config.pose import Stop as Stated
 from agent.core.anchor import Anchor
 from calib.estimate.determined import determined
-from calib.estimate.next_stop import COVERAGE_FACTOR, Flags, Joint, Plan, Wanted
 from calib.estimate.nuisances import Priors
 from calib.geometry import along, beside
 from calib.model import PARAMETERS, Array, Calibration
+from calib.visit.next_stop import COVERAGE_FACTOR, Flags, Joint, Plan, Wanted
 
 MOST_STOPS = 100  # of more, so many that are spread over them tell nearly the same
 MOST_MORE = 4  # stops that are proposed

@@ -27,9 +27,9 @@ from agent.delivery.guide import (
     Warned,
     clipped,
 )
-from calib.estimate.next_stop import MAIN, POWER, Suggestion, Wanted
 from calib.model import Array
 from calib.rounding import plus_minus
+from calib.visit.next_stop import MAIN, POWER, Suggestion, Wanted
 
 NAME_MAX = 63
 

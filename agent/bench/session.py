@@ -8,19 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agent.bench.stops import Stop, angles_of, like
+from calib.adjustment.adjustment import Adjustment, adjust
 from calib.distributions import chi2_quantile
-from calib.estimate.adjustment import Adjustment, adjust
-from calib.estimate.next_stop import Expected, Joint, Plan, Suggestion, Told, Wanted
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import S_AND_Q
-from calib.estimate.stop_order import stops_ahead
-from calib.excitation.sums import factor
 from calib.model import Window
+from calib.visit.next_stop import Expected, Joint, Plan, Suggestion, Told, Wanted
+from calib.visit.stop_order import stops_ahead
+from calib.windows.sums import factor
 
 # Probability that a right stop is called wrong, though every stated standard uncertainty were twice as large.
 FALSE_ALARM = 1e-5
 STATED_TIMES = 2.0
-# Another stop fits decisively better if it is e^12.5 = 3e5 times as likely (as in calib.estimate.verdict). This shows
+# Another stop fits decisively better if it is e^12.5 = 3e5 times as likely (as in calib.adjustment.verdict). This shows
 # a wrong turn before S is known well enough for the test above.
 DECISIVE_CHI2 = 25.0
 DOUBTED = 2.5  # standard uncertainties by which a stated value may be off before it is doubted

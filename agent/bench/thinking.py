@@ -10,8 +10,8 @@ import numpy as np
 from agent.bench.aside import Aside
 from agent.bench.measuring import Measuring, Record, Taken
 from agent.bench.session import Fit, Outlook, Session, expected_of
-from calib.estimate.next_stop import Suggestion
 from calib.model import Array, Window
+from calib.visit.next_stop import Suggestion
 
 VERY_LONG = 100.0  # times as long a stay, to see what more time would gain
 

@@ -16,7 +16,7 @@ from agent.bench.measuring import Taken
 from agent.bench.screen import told_u
 from agent.bench.stops import Stop
 from agent.bench.visiting import Ahead, Visiting, VisitLook
-from calib.estimate.clamping import Clamping
+from calib.visit.clamping import Clamping
 
 CLAMP_FROM_S = 15.0  # of samples, in which a clamp can be judged
 LEAST_STAY_S = 30.0  # before that the spread of the noise itself is hardly known

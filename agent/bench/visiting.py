@@ -9,11 +9,11 @@ import numpy as np
 
 from agent.bench.aside import Aside
 from agent.bench.measuring import Measuring, Record, Taken
-from calib.estimate.clamping import Clamping, clamping
-from calib.estimate.next_stop import COVERAGE_FACTOR, MAIN, Wanted
 from calib.estimate.quantities import LAG, S_AND_Q
 from calib.model import Array, Window
 from calib.recorded.outcome import Outcome
+from calib.visit.clamping import Clamping, clamping
+from calib.visit.next_stop import COVERAGE_FACTOR, MAIN, Wanted
 
 # Sources of the budget that shrink as more is measured: their variance goes with the inverse of the time. All others
 # stay, such as the reference, its rotation, and what was known before of the transverse sensitivities.

@@ -16,9 +16,9 @@ from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
 from agent.reading.stationxml import Component
+from calib.output_unit import common
 from calib.recorded.choice import Choice, Chosen
 from calib.recorded.columns import reference_columns, sensor_columns, si_of
-from calib.recorded.output_unit import common
 from calib.recorded.table import (
     ReferenceTable,
     SensorTable,

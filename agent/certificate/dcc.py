@@ -20,7 +20,7 @@ from agent.config.earlier import COVARIANCE, DCC, PARAMETER_LIST, SI
 from agent.report.units import output_unit
 from agent.terminal.text import one_line
 from calib.model import PARAMETERS, Array
-from calib.recorded.output_unit import G_IN
+from calib.output_unit import G_IN
 
 VERSION = "3.2.1"
 LANGUAGE = "en"

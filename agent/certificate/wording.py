@@ -13,7 +13,7 @@ from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, Certificat
 from agent.report.tables import number
 from agent.report.units import offset_unit, position_name, sensitivity_unit
 from calib.model import PARAMETERS
-from calib.recorded.output_unit import ACCELERATION
+from calib.output_unit import ACCELERATION
 from calib.rounding import plus_minus
 
 Rows = Sequence[tuple[str, str]]

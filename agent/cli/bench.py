@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from agent.bench.stops import Stop
     from agent.delivery.guide import Guide
     from agent.delivery.guide_publication import GuidePublisher
-    from calib.estimate.next_stop import Wanted
+    from calib.visit.next_stop import Wanted
 
 FIRST_S = 2.0  # of samples that tell how much the shaker moves
 THETAS_DEG, ALPHA_STEP_DEG = "35,55", 15
@@ -163,7 +163,7 @@ def _led(
     from agent.bench.measuring import Measuring
     from agent.bench.screen import Screen
     from agent.calibrate.stated import options_of
-    from calib.estimate.next_stop import Wanted
+    from calib.visit.next_stop import Wanted
 
     stops = stops_of(channel, options["thetas"], options["alphas"])
     devices = [channel.sensor, *([channel.reference] if channel.reference else [])]

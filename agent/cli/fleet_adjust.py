@@ -16,7 +16,7 @@ from agent.fleet.site_file import SiteSection, arguments_of, load_site
 from agent.fleet.telling import as_json, as_object, reasons, show, write
 from agent.reading.source import TableError
 from agent.terminal.text import say
-from calib.estimate.device import Device
+from calib.site_adjustment.device import Device
 
 
 @click.command()

@@ -18,7 +18,7 @@ from agent.cli.kernels import compute_as_in
 from agent.core.events import CalibrationUpdate
 from agent.terminal.text import one_line, say
 from agent.terminal.wording import calibration_cells
-from calib.recorded.output_unit import shown_in
+from calib.output_unit import shown_in
 from calib.rounding import aligned
 
 HEADS = ("sensor", "result", "windows", "Sxx", "Syy", "Szz", "Qx", "Qy", "Qz", "unit of S", "unit of Q")

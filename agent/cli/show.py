@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from agent.core.memory import Memory
     from agent.export.past import SensorPast
     from agent.terminal.console import TextConsole
-    from calib.estimate.sources import Sources
+    from calib.state.sources import Sources
 
 SOURCES_SHOWN = 5  # of U; --json has all
 HISTORY_SHOWN = 10  # newest calibrations and windows of a sensor
@@ -352,7 +352,7 @@ def _print_sensor(console: TextConsole, sensor: str, held: SensorHistory) -> Non
 
 def _print_calibration(console: TextConsole, calibration: CalibrationUpdate, budget: Sources | str) -> None:
     from agent.terminal.wording import calibration_cells, uncertainty_words
-    from calib.recorded.output_unit import shown_in
+    from calib.output_unit import shown_in
     from calib.rounding import aligned
 
     rows = [(axis, *cells) for axis, cells in zip("xyz", calibration_cells(calibration), strict=True)]
@@ -391,7 +391,7 @@ def _budget_object(budget: Sources | str) -> dict[str, Any]:
 def _budget_lines(budget: Sources | str, unit: str, most: int | None = SOURCES_SHOWN) -> Iterator[str]:
     """The largest sources of U (`most`; None: all), each with its part of U of the main sensitivities and of Q."""
     from calib.model import PARAMETERS
-    from calib.recorded.output_unit import shown_in
+    from calib.output_unit import shown_in
     from calib.rounding import aligned, rounded
 
     if isinstance(budget, str):

@@ -145,7 +145,7 @@ def _visit(
     from agent.bench.visit_dialogue import LEAST_STAY_S, Stay, VisitDialogue, forbidden
     from agent.bench.visiting import Visiting
     from agent.calibrate.stated import options_of
-    from calib.estimate.next_stop import COVERAGE_FACTOR, Wanted
+    from calib.visit.next_stop import COVERAGE_FACTOR, Wanted
 
     assert channel.reference is not None
     output = options["data_dir"] / channel.sensor

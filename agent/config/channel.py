@@ -17,7 +17,7 @@ from calib.model import Pose
 # Least length of a pose after its guards are taken off. A shorter pose cannot be used, and many of them, after a typing
 # error, would fill the store.
 SHORTEST_POSE_S = 0.1
-LEAST_BAND = 2.0  # the upper end of a band over the lower one: four third octaves, as calib.excitation.bands asks for
+LEAST_BAND = 2.0  # the upper end of a band over the lower one: four third octaves, as calib.windows.bands asks for
 LEAST_LEANING_DEG = 5.0  # of a clamp, if alpha is found from gravity: 1 mg of offset is 0.7 deg of alpha there
 
 

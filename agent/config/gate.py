@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from agent.config.section import Section
-from calib.estimate.drift import DriftSettings
+from calib.drift.drift import DriftSettings
 from calib.model import PARAMETERS
 
 MAX_CHANGE_OFFSET_MPS2 = 0.5  # as much as a mount that leans by 3 deg
@@ -77,5 +77,5 @@ class DriftOptions(Section):
         return self.false_alarms_a_year / 2.0
 
     def settings(self) -> DriftSettings:
-        """The settings for calib.estimate.drift.DriftTest."""
+        """The settings for calib.drift.drift.DriftTest."""
         return DriftSettings(self.of_one_test, self.windows_a_year)

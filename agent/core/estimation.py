@@ -19,19 +19,19 @@ from agent.core.hypotheses import Devices, confirmed, possible_jump, rescaled, s
 from agent.core.noise_watch import NoiseWatch
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import Found
+from calib.drift.drift import DriftTest, DriftVerdict
 from calib.estimate.axes import LEAST_S, where_nothing_moved
 from calib.estimate.correction import Law
-from calib.estimate.drift import DriftTest, DriftVerdict
 from calib.estimate.estimate import Estimate
 from calib.estimate.innovation import Innovation
-from calib.estimate.record import Record
 from calib.estimate.reference_share import ReferenceShare
-from calib.estimate.sources import Sources
-from calib.estimate.state import State
 from calib.estimate.statements import Step
-from calib.estimate.walks import Walks
 from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums, own_channels
 from calib.signal.response import Response
+from calib.state.sources import Sources
+from calib.state.state import State
+from calib.state.walks import Walks
+from calib.windows.record import Record
 
 DAY_S = 86400.0
 STATED = "stated by the configuration"  # the method of a calibration that it states with its date

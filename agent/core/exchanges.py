@@ -24,11 +24,11 @@ import numpy as np
 
 from agent.config import Channel
 from agent.core.gate import Limit
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.geometry import AXES
 from calib.geometry import STANDARD_GRAVITY_MPS2 as G
 from calib.model import Array, own_channels
+from calib.state.state import State
+from calib.windows.record import Record
 
 RANGE = "its range is another one, as after a loss of supply"
 SCALES: Mapping[float, str] = {

@@ -19,10 +19,10 @@ from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
 from calib.estimate.quantities import ALL_RATES, OFFSET, RESPONSE, Kind, Quantity
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array
+from calib.state.state import State
+from calib.windows.record import Record
 
 # Standard uncertainty with which an unknown is set free, by its unit: beyond what a mistake would hardly reach.
 FREE: Mapping[str, float] = {"rad": 0.2, "1": 0.2, "s": 0.02, "m/s2": 2.0, "Hz": 1.0, "1/K": 2e-3}

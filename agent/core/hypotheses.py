@@ -15,10 +15,10 @@ import numpy as np
 
 from agent.core.gate import Limit
 from calib.estimate.quantities import REFERENCE, REFERENCE_DRIFT, Quantity
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.geometry import AXES, STANDARD_GRAVITY_MPS2
 from calib.model import Array, Calibration, own_channels
+from calib.state.state import State
+from calib.windows.record import Record
 
 # A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
 # offset two m/s2, which is a mount that leans by 12 deg.

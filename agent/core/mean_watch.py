@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from agent.core.watch import Hour
+from calib.drift.mean_change import mean_change
 from calib.estimate.correction import Law, between
-from calib.estimate.mean_change import mean_change
 from calib.model import Array
 
 WEEK, DAY = 168, 24  # hours: in the first ones the mean is learnt; the mean of the newest ones is compared with it

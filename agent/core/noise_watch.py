@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.estimate.record import Record
-from calib.estimate.state import MOST_REFERENCES
 from calib.geometry import AXES
 from calib.model import Array
+from calib.state.state import MOST_REFERENCES
+from calib.windows.record import Record
 
 FIRST = 24  # windows that are learnt: of fewer, the third largest number is no bound of what is usual
 LOW = 2  # so many of the bounds may be too low, and so many of the first windows too noisy

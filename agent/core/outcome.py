@@ -20,13 +20,13 @@ from agent.core.events import (
     SteadySensitivity,
     WindowReport,
 )
-from calib.estimate.drift import DriftVerdict
+from calib.drift.drift import DriftVerdict
 from calib.estimate.quantities import RATES, SENSITIVITY_PER_K, offset_temperature
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import ResponseTold
-from calib.estimate.sources import Sources
-from calib.estimate.state import State
 from calib.model import Array, Calibration, Window
+from calib.state.sources import Sources
+from calib.state.state import State
 
 UNCERTAINTY = "combined"
 MOST_TEMPERATURE_ORDER = 2

@@ -16,9 +16,9 @@ from agent.core.events import CalibrationUpdate
 from agent.core.kept import MALFORMED, update_of
 from agent.core.memory import Memory
 from agent.core.snapshot import pack, unpack
-from calib.estimate.dating import Date
-from calib.estimate.past import Past
-from calib.estimate.sources import Sources
+from calib.state.dating import Date
+from calib.state.past import Past
+from calib.state.sources import Sources
 
 
 class PastError(ValueError):

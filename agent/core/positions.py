@@ -12,12 +12,12 @@ import numpy as np
 from agent.config import Channel
 from agent.core.schedule import Piece, Stance, pieces
 from agent.core.stream import UNCOUNTED, DeviceStream
-from calib.estimate.state import State
 from calib.excitation.placing import Knowledge, Placed, clamp_angles, mean_output, nearest_stop
 from calib.excitation.standing import KEPT, MEAN_S, Standing
 from calib.excitation.window_verdict import Limits
 from calib.model import Array, Pose
 from calib.signal.samples import Samples
+from calib.state.state import State
 from hw.block import SampleBlock
 
 FOUND_WITHIN_S = KEPT * MEAN_S  # of samples that may still turn out to belong to a stretch

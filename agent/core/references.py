@@ -9,7 +9,7 @@ from agent.config import Channel
 from agent.config.knowledge import Certificate
 from agent.core.estimation import Estimation
 from agent.core.identity import identity_of, not_certified
-from calib.estimate.state import DATED
+from calib.state.state import DATED
 
 
 class References:

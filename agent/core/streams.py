@@ -18,8 +18,8 @@ from agent.core.schedule import Piece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
 from agent.core.windows import Found, aligned_in, limits_of, margin_of, refused, windows_in
-from calib.estimate.lag_search import without_lag
 from calib.excitation.front_end import most_margin_s
+from calib.excitation.lag_search import without_lag
 from calib.excitation.placing import Placed
 from calib.model import Array, Pose, Window
 from calib.signal.response import FLAT, UNSETTLED, Response

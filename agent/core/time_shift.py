@@ -17,13 +17,13 @@ import numpy as np
 from agent.config import Channel
 from agent.core.gate import Limit
 from agent.core.windows import Found
-from calib.estimate.lag_search import BASIN_RAD, largest_omega, longest_in_time, minima, misfit_by_lag, without_lag
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.excitation.front_end import Aligned
+from calib.excitation.lag_search import BASIN_RAD, largest_omega, longest_in_time, minima, misfit_by_lag, without_lag
 from calib.model import Array, Pose, own_channels
 from calib.signal.order_statistics import median
+from calib.state.state import State
+from calib.windows.record import Record
 
 FOUND_WITHIN_U = 4.0  # stated standard uncertainties; one sound lag in 16,000 is beyond
 # Beyond that range, a lag is looked for only to tell the operator: as far again, and at least as far as this.

@@ -10,7 +10,6 @@ import numpy as np
 from agent.config import Channel
 from agent.core.schedule import Piece
 from agent.core.stream import DeviceStream
-from calib.excitation.bands import ABOVE, HIGHEST, motion_band_hz, share_above
 from calib.excitation.front_end import (
     LEAST_MARGIN_S,
     Aligned,
@@ -25,6 +24,7 @@ from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
 from calib.model import Window
 from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
+from calib.windows.bands import ABOVE, HIGHEST, motion_band_hz, share_above
 
 
 @dataclass(frozen=True, slots=True, eq=False)

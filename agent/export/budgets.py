@@ -14,7 +14,7 @@ from agent.delivery.history import History
 from agent.export.at_the_end import starts_of
 from agent.export.samples import ExportError, followed, start_of, steps_of
 from agent.recording.files import recordings
-from calib.estimate.sources import Sources
+from calib.state.sources import Sources
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,11 +21,11 @@ from agent.export.at_the_end import memories_at_the_end
 from agent.export.samples import followed, new_file, steps_of
 from agent.export.smoothing import date_of, smoothing
 from agent.export.tables import cell
-from calib.estimate.dating import PROBABILITY, Date
-from calib.estimate.past import Change
 from calib.model import PARAMETERS, Array
-from calib.recorded.output_unit import shown_in
+from calib.output_unit import shown_in
 from calib.rounding import aligned, plus_minus, rounded
+from calib.state.dating import PROBABILITY, Date
+from calib.state.past import Change
 
 DATED = ("change", "u_change_days", "change_after", "change_before")  # columns of CSV
 SHOWN = ("Sxx", "Syy", "Szz", "Qx", "Qy", "Qz")

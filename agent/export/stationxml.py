@@ -24,10 +24,10 @@ from agent.export.seismic import INDICATION, NETWORK, channel_code, station_code
 from agent.export.smoothing import smoothing
 from agent.terminal.text import one_line
 from calib.estimate.correction import Law
-from calib.estimate.past import REACH_DAYS
 from calib.model import PARAMETERS
-from calib.recorded.output_unit import written
+from calib.output_unit import written
 from calib.rounding import plus_minus
+from calib.state.past import REACH_DAYS
 
 NAMESPACE, VERSION = "http://www.fdsn.org/xml/station/1", "1.2"
 AXES = 3

@@ -9,12 +9,12 @@ import numpy as np
 
 from agent.fleet.meeting import Meeting
 from calib.distributions import coverage_factor
-from calib.estimate.contradiction import Verdict, suspects, verdicts
 from calib.estimate.determined import determined
-from calib.estimate.device import Device
-from calib.estimate.link import GRAVITY_NAME
-from calib.estimate.site import Site
 from calib.model import Array
+from calib.site_adjustment.contradiction import Verdict, suspects, verdicts
+from calib.site_adjustment.device import Device
+from calib.site_adjustment.link import GRAVITY_NAME
+from calib.site_adjustment.site import Site
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,8 +15,6 @@ from agent.calibrate.tables import ReferenceFile
 from agent.config.earlier import EarlierError, read_earlier
 from agent.fleet.site_file import DeviceSection
 from agent.reading.source import TableError
-from calib.estimate.device import Device
-from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Applied, Priors
 from calib.model import Array, Window, own_channels
 from calib.recorded.adjusting import adjusted, over_frequency
@@ -24,6 +22,8 @@ from calib.recorded.options import Options
 from calib.recorded.priors import NOMINAL_TRANSVERSE, instrument_of, priors_of
 from calib.recorded.tables import Tables
 from calib.signal.response import FLAT, Response
+from calib.site_adjustment.device import Device
+from calib.site_adjustment.link import Link, link
 
 WORST_CONDITION = 1e3  # of S: a dead output makes it infinite
 ROUNDING = 1e-9  # of the largest eigenvalue of a covariance

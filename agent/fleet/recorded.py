@@ -28,7 +28,6 @@ from agent.reading.recording import end_of
 from agent.reading.source import TableError
 from agent.recording.reading import RecordingReader, first_event
 from agent.terminal.text import say
-from calib.estimate.device import Device
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import YEAR_DAYS
 from calib.excitation.front_end import Settings
@@ -37,6 +36,7 @@ from calib.model import Array
 from calib.recorded.poses import PoseInterval
 from calib.recorded.table import ReferenceTable, SensorTable
 from calib.recorded.tables import Making, Tables
+from calib.site_adjustment.device import Device
 
 YEAR_S = YEAR_DAYS * 86400.0
 

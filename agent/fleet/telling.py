@@ -12,11 +12,11 @@ import numpy as np
 from agent import __version__
 from agent.fleet.adjusting import Adjusted
 from agent.terminal.text import say
-from calib.estimate.contradiction import FALSE_ALARM, Verdict
-from calib.estimate.link import GRAVITY_NAME
 from calib.model import Array
 from calib.recorded.outcome import plain
 from calib.rounding import plus_minus
+from calib.site_adjustment.contradiction import FALSE_ALARM, Verdict
+from calib.site_adjustment.link import GRAVITY_NAME
 
 METHOD = "site adjustment"
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from agent.config.files import open_file
 from calib.model import Array
-from calib.site.day import HOURS, Day, Hours, day_of
+from calib.site_watch.day import HOURS, Day, Hours, day_of
 
 HOUR_NS = 3_600_000_000_000
 LONGEST_LINE = 1 << 20  # bytes

@@ -12,8 +12,8 @@ import numpy as np
 
 from agent import __version__
 from agent.fleet.watched import Watched
-from calib.site.verdicts import WALK_PER_ROOT_DAY, Result, Told, result
-from calib.site.watch import SiteWatch
+from calib.site_watch.verdicts import WALK_PER_ROOT_DAY, Result, Told, result
+from calib.site_watch.watch import SiteWatch
 
 U_VISIT = 0.003  # relative standard uncertainty of what a visit finds
 U_UNKNOWN = 0.01  # of a calibration that states none

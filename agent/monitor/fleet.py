@@ -41,7 +41,7 @@ _MAIN_NAMES = frozenset(PARAMETERS[i] for i in MAIN)
 # Fields of a verdict that a row has.
 VERDICT = ("parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "t_utc_ns",
            "false_alarms_a_year")  # fmt: skip
-# As calib.estimate.state.DATED puts the date of the certificate behind the identity of a reference.
+# As calib.state.state.DATED puts the date of the certificate behind the identity of a reference.
 _CALIBRATED = re.compile(r"(.*), calibrated ([0-9]{4}-[0-9]{2}-[0-9]{2})", re.DOTALL)
 IN_TURNS = (
     "two runs have given results the same numbers: gateways with copies of one memory card are on the bus in turns, "

@@ -14,8 +14,8 @@ from pydantic import Field
 from agent.core.events import DeviceChange, Event, RunStart
 from agent.recording.reading import RecordingReader, first_event
 from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
+from hw.data_time import DataClock, together
 from hw.sensor import Clock, ConfigurationError, DeviceLost, Options, boot_id, system_clock
-from hw.virtual.data_time import DataClock, together
 
 BLOCK_S = 0.5
 

@@ -13,7 +13,7 @@ from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
 from agent.report.units import offset_unit, reference_name, sensitivity_unit
 from agent.terminal.text import page_text
-from calib.recorded.output_unit import ACCELERATION
+from calib.output_unit import ACCELERATION
 
 
 def page(material: Material, figures: Sequence[Drawn], seen: Sequence[Residuals]) -> str:

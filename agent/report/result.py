@@ -16,7 +16,7 @@ from agent.calibrate.origin import SourceFile
 from agent.core.events import CalibrationUpdate
 from calib.estimate.axes import axis_warnings
 from calib.model import PARAMETERS, Array
-from calib.recorded.output_unit import shown_in
+from calib.output_unit import shown_in
 
 Item = TypeVar("Item")
 Row = tuple[float | None, float | None, float | None]

@@ -13,7 +13,7 @@ from agent.report.trace import Residuals
 from agent.report.units import offset_unit, output_unit, position_name, said, sensitivity_unit
 from agent.terminal.text import page_text
 from calib.model import PARAMETERS
-from calib.recorded.output_unit import ACCELERATION
+from calib.output_unit import ACCELERATION
 from calib.rounding import plus_minus
 
 AXES = "xyz"

@@ -15,7 +15,7 @@ from agent.report.style import INK, PALE, REFUSED, SHADES, USED, bare, figure, s
 from agent.report.units import offset_unit, position_name
 from agent.terminal.text import figure_text
 from calib.model import PARAMETERS
-from calib.recorded.output_unit import shown_in
+from calib.output_unit import shown_in
 
 LANES = 16  # a figure has room for so many positions; if there are more, windows are arranged by verdict
 MAIN = [0, 4, 8]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib.recorded.output_unit import ACCELERATION, shown_in, written
+from calib.output_unit import ACCELERATION, shown_in, written
 
 _REFERENCES = {
     "acceleration": "reference accelerometer",

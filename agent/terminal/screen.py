@@ -27,7 +27,7 @@ from agent.terminal.wording import (
     verdict,
     window_span,
 )
-from calib.recorded.output_unit import shown_in
+from calib.output_unit import shown_in
 
 REFRESH_S = 0.5  # results come a few times a minute, the clock changes once a second
 

@@ -22,7 +22,7 @@ from agent.core.events import (
 )
 from agent.terminal.quantity import counted, size
 from calib.model import Array
-from calib.recorded.output_unit import shown_in
+from calib.output_unit import shown_in
 from calib.rounding import plus_minus
 
 if TYPE_CHECKING:

@@ -17,13 +17,13 @@ from benchmarks.online.config import building_config
 from benchmarks.online.node import Node, Stated, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.excitation.bands import band_sums, beside_noise
-from calib.excitation.sums import window_sums
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import Array, Pose, Window
+from calib.state.state import State
+from calib.windows.bands import band_sums, beside_noise
+from calib.windows.record import Record
+from calib.windows.sums import window_sums
 from hw.virtual.building import Building, BuildingParameters
 from hw.virtual.building_motion import Band, BuildingMotion
 from hw.virtual.noise import Stream

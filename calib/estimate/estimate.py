@@ -25,13 +25,13 @@ from calib.estimate.gauss_newton import Lines, gauss_newton
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.physics import SIZE, STEP, Stack, Windows
 from calib.estimate.quantities import KINDS, LAG, PRIOR, RESPONSE, Quantity
-from calib.estimate.record import Record, together
 from calib.estimate.rows import Degrees, Noise, Rows
 from calib.estimate.statements import Statements
-from calib.estimate.type_a import Index
 from calib.estimate.unknowns import Unknown, Unknowns
 from calib.model import Array
 from calib.signal.order_statistics import distinct
+from calib.windows.record import Record, together
+from calib.windows.type_a import Index
 
 Seen = tuple[float, float]  # the lowest and highest temperature in degC of a window; NaN before any had one
 

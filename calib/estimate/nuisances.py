@@ -14,7 +14,6 @@ from typing import ClassVar
 import numpy as np
 
 from calib.estimate import physics
-from calib.estimate.deviations import ByAxis, LeftOpen
 from calib.estimate.quantities import (
     LAG,
     PRIORS,
@@ -29,6 +28,7 @@ from calib.estimate.terms import terms
 from calib.model import Array, Pose, scale_of
 from calib.signal.known_response import UNKNOWN, KnownResponse
 from calib.signal.response import ALL_POWERS, FLAT, NO_MOTION, Response, ResponseModel, by_term
+from calib.windows.deviations import ByAxis, LeftOpen
 
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
 # It is honest for filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).

@@ -28,10 +28,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib.estimate.record import TERMS, Record
-from calib.estimate.type_a import Index
 from calib.model import Array, own_channels
 from calib.signal.response import by_term
+from calib.windows.record import TERMS, Record
+from calib.windows.type_a import Index
 
 STEP = 1e-30  # of the complex step: its square is lost beside 1, so that the derivative is exact
 AT_ONCE = 1000  # windows times inputs whose derivatives are found together: some 3 MB
@@ -50,7 +50,7 @@ BESIDE = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))  # axis of the referen
 @dataclass(frozen=True, slots=True, eq=False)
 class Stack:
     """What the physics needs of W windows with M channels and k rows of means, each (W, ...), under the names that
-    calib.estimate.record.Record has for them. `direction` (W, 3, M) and `gravity_mps2` (W, 3) as stated, NaN where
+    calib.windows.record.Record has for them. `direction` (W, 3, M) and `gravity_mps2` (W, 3) as stated, NaN where
     nobody stated gravity; `response` (W, TERMS). `excited` (W, 3, 3) is the identity where all directions count."""
 
     direction: Array

@@ -72,7 +72,7 @@ class Kind:
     `straight`: the change up to which its product with S counts as linear; LINEAR if it is not multiplied by S.
     `stated`: the prior is a statement that the data may contradict; if false, only the data determine the value.
     `per_k`: its effect is multiplied by the temperature of a window "above" that of S and Q, or by how far the body of
-    the sensor is "behind" it (calib.estimate.record.Record.behind_k).
+    the sensor is "behind" it (calib.windows.record.Record.behind_k).
     `since_certificate`: it grows from the date of the reference's certificate on, without a limit. `prior` is then its
     standard uncertainty after one year; a state begins with that of the time since this date (calib.estimate.unknowns).
     """
@@ -301,7 +301,7 @@ RESPONSE = Kind(
     # Of both instruments together, as the lag is.
     "response", "1", "response over frequency",
     prior=Statement("response"), mean=Statement("response_at"),
-    of_reference=True, straight=LINEAR, stated=False,  # calib.estimate.over_frequency sees whether it changed
+    of_reference=True, straight=LINEAR, stated=False,  # calib.state.over_frequency sees whether it changed
     loosened_by=("filter",),
 )  # fmt: skip
 ROTATION = Kind(

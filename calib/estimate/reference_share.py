@@ -16,7 +16,6 @@ import numpy as np
 
 from calib.estimate.estimate import Now
 from calib.estimate.quantities import REFERENCE, REFERENCE_CORNER
-from calib.estimate.solution import Solution
 from calib.estimate.unknowns import EXACT
 from calib.model import Array
 
@@ -117,26 +116,3 @@ def share_in(now: Now, factor: Array, reference: str, sensitivity: float) -> Ref
         tuple(u.quantity.kind.name for u in unknowns), np.array([u.mean for u in unknowns]), np.sqrt(variance),
         now.mean[own], rows @ rows.T / variance, (factor[:, :n] @ rows.T) / variance,
     )  # fmt: skip
-
-
-def share_after(solution: Solution) -> ReferenceShare | None:
-    """The share of the only reference of an adjustment, whose name is not known; None where it states no error."""
-    terms = solution.equations.nuisances.terms
-    own = [12 + j for j, term in enumerate(terms) if term.kind.of_certificate]
-    if not own:
-        return None
-    chosen = [terms[k - 12] for k in own]
-    applied = np.array([term.applied for term in chosen])
-    u = np.array([term.uncertainty for term in chosen])
-    derivative = solution.half @ solution.half[own].T / u**2
-    return ReferenceShare(
-        "",
-        np.ones(1),
-        tuple(term.name for term in chosen),
-        tuple(term.kind.name for term in chosen),
-        solution.prior_mean[own] + applied,
-        u,
-        solution.x[own] + applied,
-        derivative[own],
-        derivative[:12],
-    )

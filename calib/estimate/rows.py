@@ -10,7 +10,6 @@ from itertools import accumulate
 import numpy as np
 
 from calib.estimate import physics
-from calib.estimate.condense import regressed
 from calib.estimate.physics import Stack, Windows
 from calib.estimate.quantities import (
     REFERENCE_DRIFT,
@@ -20,11 +19,12 @@ from calib.estimate.quantities import (
     YEAR_DAYS,
     offset_temperature,
 )
-from calib.estimate.record import TERMS, TOLD, Record
 from calib.estimate.statements import FLAT
-from calib.estimate.type_a import LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
 from calib.estimate.unknowns import Unknowns
 from calib.model import Array, own_channels
+from calib.windows.condense import regressed
+from calib.windows.record import TERMS, TOLD, Record
+from calib.windows.type_a import LEAST_INFLATION, LEVELS, SUMS, Scattered, scattered
 
 # Of a pool of noise: a window tells half as much of the noise of another one with so many windows between them. Noise
 # changes with traffic, weather and the season; 100 windows of ten segments know a variance to 5 %.
@@ -34,7 +34,7 @@ HALF_WINDOWS = 100.0
 @dataclass(frozen=True, eq=False)
 class Noise:
     """How much slopes and means of a window scatter, by it and those near it: `scores` (2, LEVELS, SUMS) of
-    calib.estimate.type_a, summed.
+    calib.windows.type_a, summed.
 
     Where segments are few, the rest is what a filter makes of white noise.
     """

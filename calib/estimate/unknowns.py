@@ -23,10 +23,10 @@ from calib.estimate.quantities import (
     Quantity,
     offset_temperature,
 )
-from calib.estimate.record import Record
 from calib.estimate.statements import DOUBT, FLAT, Dated, Statements, Widening
 from calib.estimate.terms import Term, reference_over_temperature, terms
 from calib.model import Array
+from calib.windows.record import Record
 
 EXACT = 1e-9  # standard uncertainty, relative to the scale, of what is known exactly
 LEAST_KEPT = 1e-6  # of its distance from the centre, what a bounded walk keeps over the longest pause

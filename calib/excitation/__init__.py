@@ -1,1 +1,1 @@
-"""Detection of motion and rest, windows of known excitation, and the sums of their samples."""
+"""The front end: where the sensor moves or rests, and which windows come of it. Begin with `front_end.py`."""

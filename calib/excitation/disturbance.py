@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.excitation.bands import parts
 from calib.excitation.detection import RELATED, incoherent_by_band
 from calib.excitation.turning import is_turned
 from calib.excitation.windows import Points
@@ -20,6 +19,7 @@ from calib.model import Array, BandSums
 from calib.signal.band import convolved, hanning
 from calib.signal.order_statistics import distinct
 from calib.signal.response import Complex
+from calib.windows.bands import parts
 
 SEGMENTS = 8  # Hann segments, half overlapped, in which the noise is looked for
 CELL = 2  # lines of each segment

@@ -16,7 +16,6 @@ import numpy as np
 
 from calib.excitation import detection
 from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
-from calib.excitation.bands import TAPER, beside_noise
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
 from calib.excitation.hum import hum_hz, without_lines
 from calib.excitation.knocks import knocks
@@ -39,6 +38,7 @@ from calib.signal.resampling import (
 )
 from calib.signal.response import FLAT, Response, passed
 from calib.signal.samples import Samples
+from calib.windows.bands import TAPER, beside_noise
 
 # Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
 # differentiating and of the low-pass filter at 100 Hz and above.

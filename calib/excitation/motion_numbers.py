@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from calib.excitation import detection
-from calib.excitation.sums import factor
 from calib.excitation.window_verdict import DRIFT_SD, Limits
 from calib.model import Array, WindowSums
 from calib.signal.order_statistics import median
+from calib.windows.sums import factor
 
 
 def motion_numbers(

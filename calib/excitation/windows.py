@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from calib import geometry
 from calib.excitation import detection
 from calib.excitation.band_to_keep import LEAST_MOTION_MPS2
-from calib.excitation.bands import band_sums
 from calib.excitation.motion_numbers import motion_numbers
 from calib.excitation.rests import find_rests
 from calib.excitation.steadiness import nonlinearity, step
-from calib.excitation.sums import pool, window_sums
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, BandSums, Pose, Window, WindowSums
 from calib.signal.order_statistics import median
 from calib.signal.stamps import OFF_S
+from calib.windows.bands import band_sums
+from calib.windows.sums import pool, window_sums
 
 CALM = "the reference is calm here"  # compared with the rest of the samples
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
@@ -187,7 +187,7 @@ def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *,
 
 
 def rests_anywhere(time_s: Array, V: Array, gravity_mps2: float, limits: Limits = DEFAULT_LIMITS) -> list[Window]:
-    """A window for each rest in samples of a sensor in unknown positions, for `calib.estimate.norm_fit.norm_fit`.
+    """A window for each rest in samples of a sensor in unknown positions, for `calib.adjustment.norm_fit.norm_fit`.
 
     `time_s` (n,) in s, `V` (n, 3) in output unit, `gravity_mps2` the magnitude of gravity. The pose of each window has
     gravity along z in place of its unknown direction; a norm fit does not use the pose.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.excitation.sums import factor
 from calib.model import PARAMETERS, Array, Calibration, Pose, Window
+from calib.windows.sums import factor
 
 # Least singular value of an excited direction, relative to the largest (columns scaled to one). It is 3e-6 for clamp
 # positions of 0, 1 and 2 deg; rounding errors alone give 1e-15.

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.estimate.nuisances import Applied, Inputs, Nuisances, Priors
-from calib.excitation.sums import pool
 from calib.model import Array, Pose, Window
 from calib.paper.method3 import Fit
 from calib.paper.propagation import Contribution, Statement, propagate
+from calib.windows.sums import pool
 
 
 def statement(fit: Fit, windows: Sequence[Window], priors: Priors) -> Statement:

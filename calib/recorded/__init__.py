@@ -1,1 +1,4 @@
-"""From recorded samples of a sensor and a reference to S and Q: what files and a notebook share."""
+"""From recorded samples of a sensor and a reference to S and Q: what files and a notebook share.
+
+Begin with `calibrating.py`.
+"""

@@ -8,22 +8,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from calib.estimate.adjustment import Adjustment, adjust
-from calib.estimate.condense import condense, mean_frequency_hz
-from calib.estimate.lag_search import correlated_lag_s, largest_omega, without_lag
-from calib.estimate.norm_fit import norm_fit
+from calib.adjustment.adjustment import Adjustment, adjust
+from calib.adjustment.norm_fit import norm_fit
+from calib.adjustment.response_by_band import told_by_band
+from calib.adjustment.verdict import MOST_BETWEEN_BANDS, response_reasons
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import RESPONSE
-from calib.estimate.response_by_band import told_by_band
 from calib.estimate.response_told import LEFT_U, ResponseTold
-from calib.estimate.verdict import MOST_BETWEEN_BANDS, response_reasons
-from calib.excitation.bands import lowest_hz, motion_band_hz
-from calib.excitation.excited import excited_together
-from calib.excitation.narrower import Band, narrower_bands
+from calib.excitation.lag_search import correlated_lag_s, largest_omega, without_lag
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array, Window
 from calib.recorded.certificate import ReferenceCertificate
+from calib.recorded.narrower import Band, narrower_bands
 from calib.recorded.options import Options
 from calib.recorded.outcome import NuisanceValue, Outcome, nothing_used
 from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
@@ -33,6 +30,9 @@ from calib.rounding import from_to
 from calib.signal.known_response import known_of
 from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.stamps import clock_from_stamps
+from calib.windows.bands import lowest_hz, motion_band_hz
+from calib.windows.condense import condense, mean_frequency_hz
+from calib.windows.excited import excited_together
 
 METHOD = "3 (adjustment)"
 LAG_SD, LAG_PERIODS = 3.0, 3.0  # how far a lag is searched: stated standard uncertainties, periods of the motion
@@ -73,7 +73,7 @@ def adjusted(
     """The outcome for these tables and priors. `certificate` is that of the reference, if it is given.
 
     Sensor and reference are limited to `band_hz`. Where it is not stated and the response over frequency leads to a
-    refusal, as at a filter's edge, narrower bands are tried (calib.excitation.narrower), from wide to narrow. The first
+    refusal, as at a filter's edge, narrower bands are tried (calib.recorded.narrower), from wide to narrow. The first
     one that is not refused is used, if half an octave less tells the same. Its bands of frequency may deviate from one
     response by the limit over the number of bands that were tried.
     """

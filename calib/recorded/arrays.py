@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from calib.model import Array
+from calib.output_unit import common
 from calib.recorded.choice import Choice, Chosen, Column
 from calib.recorded.columns import reference_columns, sensor_columns, si_of
 from calib.recorded.errors import InputError
-from calib.recorded.output_unit import common
 from calib.recorded.poses import AXIS, SPAN, PoseRow, Poses, columns_of
 from calib.recorded.table import (
     REFERENCES,

@@ -14,7 +14,7 @@ from calib import __version__
 from calib.estimate.axes import where_nothing_moved
 from calib.estimate.response_told import BandSensitivity
 from calib.model import Array, Calibration, Window
-from calib.recorded.output_unit import shown_in
+from calib.output_unit import shown_in
 from calib.rounding import KNOWN_BEFORE, from_to, plus_minus
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ class Outcome:
     def cells(self) -> list[str]:
         """(12,) each parameter as value ± U; with KNOWN_BEFORE where the data do not halve its prior uncertainty.
 
-        In the units of `calib.recorded.output_unit.shown_in`: g/g and mg where the sensor's output is in g.
+        In the units of `calib.output_unit.shown_in`: g/g and mg where the sensor's output is in g.
         """
         factors = shown_in(self.unit).factors
         values, expanded = (factors * each for each in (self.values, self.expanded_uncertainty))

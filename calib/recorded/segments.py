@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import itertools
 
-from calib.excitation.sums import merge, pool
 from calib.model import WindowSums
+from calib.windows.sums import merge, pool
 
 MOST_SEGMENTS = 1 << 15  # of a recording; half a second each, they are four and a half hours
 

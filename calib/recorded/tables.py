@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from calib.excitation.alignment import Drift, drift
-from calib.excitation.bands import HANN
 from calib.excitation.front_end import (
     DEFAULT_SETTINGS,
     Aligned,
@@ -24,6 +22,7 @@ from calib.excitation.front_end import (
 from calib.excitation.pieces import pieces_of
 from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
+from calib.recorded.alignment import Drift, drift
 from calib.recorded.errors import InputError
 from calib.recorded.poses import PoseInterval
 from calib.recorded.segments import segments_joined, with_joined
@@ -33,6 +32,7 @@ from calib.signal.band import HALVED, STOP_BAND
 from calib.signal.instrument import Instrument
 from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
+from calib.windows.bands import HANN
 
 HIGHEST_LIMIT = 0.4  # of the sampling rate: a limit above leaves nothing to remove
 GUARD_S = 0.1  # not used at both ends of a pose, because of handling and of errors of the clocks

@@ -13,8 +13,8 @@ import numpy as np
 
 from calib.estimate.quantities import BETWEEN_WINDOWS, KINDS
 from calib.model import PARAMETERS, Array
+from calib.output_unit import shown_in
 from calib.recorded.options import STATED
-from calib.recorded.output_unit import shown_in
 from calib.rounding import KNOWN_BEFORE, aligned, plus_minus, rounded
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ AXES = "xyz"
 MAIN, OFFSET = (0, 4, 8), (9, 10, 11)
 MOST_SOURCES = 3
 _FILTERS = "`sensor_filter`, `reference_filter`"
-# What makes a source of the uncertainty smaller that no option states (calib.estimate.budget).
+# What makes a source of the uncertainty smaller that no option states (calib.adjustment.budget).
 _WAYS = {
     "type A": "longer or more windows, or stronger motion",
     "lag between windows": "longer windows, or one clock for both devices",

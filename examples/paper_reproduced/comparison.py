@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.estimate.nuisances import Priors
-from calib.excitation.sums import window_sums
 from calib.model import Array, Window, WindowSums
 from calib.paper import method1, method2, method3, method3_budget
 from calib.paper.amplitudes import AmplitudeCalibration, Run
 from calib.paper.propagation import Statement
 from calib.paper.sine_fit import cycle_edges, four_parameter
 from calib.paper.statistics import differences_pct, rel_s_pct, repeatability
+from calib.windows.sums import window_sums
 from paper_reproduced.bench import Device
 
 MAIN = np.array([0, 4, 8])

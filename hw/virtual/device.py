@@ -12,9 +12,9 @@ from pydantic import Field, field_validator
 
 from hw.block import DeviceInfo
 from hw.buffered_sensor import BUFFER_S, BufferedSensor, Indications
+from hw.data_time import DataClock, together
 from hw.sensor import Clock, DeviceLost, Options, system_clock
 from hw.virtual.bench import Bench
-from hw.virtual.data_time import DataClock, together
 from hw.virtual.parameters import BenchParameters, ReferenceParameters
 from hw.virtual.presets import PRESETS
 from hw.virtual.timebase import BenchTime

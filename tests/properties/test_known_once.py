@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import S_AND_Q, Quantity
-from calib.estimate.record import Record
 from calib.estimate.rows import Degrees, Noise, Rows
-from calib.estimate.state import State
 from calib.estimate.statements import Statements
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import building_window
 
 HOUR = 1.0 / 24.0

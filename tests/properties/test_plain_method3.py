@@ -8,10 +8,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.excitation.sums import merge, pool, window_sums
 from calib.geometry import clamp
 from calib.model import Pose, Window
 from calib.paper.method3 import solve
+from calib.windows.sums import merge, pool, window_sums
 
 Points = list[tuple[Pose, np.ndarray, np.ndarray, np.ndarray]]
 

@@ -18,12 +18,12 @@ import pytest
 
 from calib.estimate.estimate import Now, estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
 from calib.estimate.statements import Dated, Statements, Step
-from calib.estimate.thinning import merged
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Array, Pose
 from calib.signal.response import ResponseModel
+from calib.state.thinning import merged
+from calib.windows.record import Record
 from tests.clamp_windows import G_MPS2, frame
 from tests.drawn_records import UP, Truth, scatter, template, told
 

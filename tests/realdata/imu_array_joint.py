@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.estimate.norm_fit import NormFit, norm_fit
+from calib.adjustment.norm_fit import NormFit, norm_fit
 from calib.excitation.windows import rests_anywhere
 from calib.model import Array
 from tests.realdata.test_imu_array_site import GRAVITY_MPS2, ROTATIONS, deviations, rests

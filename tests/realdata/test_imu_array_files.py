@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calib.estimate.norm_fit import PARAMETER, NormFit, norm_fit
+from calib.adjustment.norm_fit import PARAMETER, NormFit, norm_fit
 from calib.estimate.nuisances import Priors
 from calib.excitation.front_end import Settings
 from calib.excitation.windows import rests_anywhere

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.norm_fit import norm_fit
+from calib.adjustment.norm_fit import norm_fit
 from calib.excitation.windows import rests_anywhere
 from calib.model import Calibration
 from tests.imu_pair import Array, calibrated

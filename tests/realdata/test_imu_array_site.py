@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from agent.cli.main import run_cli
-from calib.estimate.norm_fit import NormFit, norm_fit
+from calib.adjustment.norm_fit import NormFit, norm_fit
 from calib.excitation.windows import rests_anywhere
 from tests.realdata.datasets import dataset
 

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
 from calib.geometry import at_rest
 from calib.model import Window, WindowSums

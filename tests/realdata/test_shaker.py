@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.estimate.adjustment import Adjustment, adjust
+from calib.adjustment.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Applied, Priors
-from calib.excitation.sums import window_sums
 from calib.geometry import along
 from calib.model import Window
 from calib.signal.resampling import resample
 from calib.signal.stamps import clock_from_stamps
+from calib.windows.sums import window_sums
 from tests.realdata.datasets import dataset
 
 ALONG_X = along([1.0, 0.0, 0.0])

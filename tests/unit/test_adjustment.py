@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Applied, Priors
 from calib.model import Pose
 from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE, TRUTH, Faults, clamp_points, window_of

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import Adjustment, adjust
-from calib.estimate.condense import condense
+from calib.adjustment.adjustment import Adjustment, adjust
+from calib.adjustment.slope_scatter import SlopeScatter
 from calib.estimate.nuisances import Applied, Priors
-from calib.estimate.record import Record
-from calib.estimate.slope_scatter import SlopeScatter
 from calib.model import Pose, Window
 from calib.signal.corner import integral, with_integral, without_corner
+from calib.windows.condense import condense
+from calib.windows.record import Record
 from tests.clamp_windows import ALPHAS_DEG, G_MPS2, S_TRUE, TRUTH, frame, window_of
 
 RATE_HZ, SECONDS, CORNER_HZ = 200.0, 20.0, 0.16

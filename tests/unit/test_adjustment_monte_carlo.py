@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
 from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, Faults, clamp_points, frame
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.norm_fit import norm_fit
+from calib.adjustment.norm_fit import norm_fit
 from calib.geometry import at_rest
 from calib.model import Window, WindowSums
 from tests.clamp_windows import Q_TRUE

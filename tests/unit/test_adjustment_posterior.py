@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import Adjustment, adjust
+from calib.adjustment.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Priors
 from calib.excitation.windows import Points, motion_windows
 from calib.geometry import along

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import Adjustment, adjust
+from calib.adjustment.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Priors
 from calib.model import Pose, Window
 from tests.clamp_windows import S_TRUE, Faults, clamp_points, window_of

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.condense import condense
 from calib.model import Pose, Window
+from calib.windows.condense import condense
 from tests.clamp_windows import window_of
 
 REST = Pose("rest", np.zeros((3, 0)), np.array([0.0, 0.0, 9.81]))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.excitation.alignment import drift, segment_lags
 from calib.excitation.windows import Points, motion_windows
 from calib.geometry import beside, clamp
 from calib.model import Pose, Window
 from calib.paper.method3 import fit
+from calib.recorded.alignment import drift, segment_lags
 from calib.recorded.poses import PoseInterval
 from calib.recorded.table import ReferenceTable, SensorTable
 from calib.recorded.tables import Making, Tables

@@ -12,10 +12,10 @@ from agent.bench.growth import MONTH_DAYS, Growth
 from agent.bench.visit_dialogue import forbidden
 from agent.bench.visiting import ahead
 from benchmarks.visits import Visit
-from calib.estimate.clamping import Clamping, clamping
-from calib.estimate.next_stop import Wanted
 from calib.model import PARAMETERS, Calibration
 from calib.recorded.outcome import Outcome
+from calib.visit.clamping import Clamping, clamping
+from calib.visit.next_stop import Wanted
 from hw.virtual.visits import Clamped
 
 SECONDS = 30.0

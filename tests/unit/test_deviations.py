@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calib.distributions import chi2_quantile
-from calib.estimate.deviations import PROBABILITY, BetweenBands, Deviations, LeftOpen
-from calib.estimate.record import Record
-from calib.excitation.bands import band_sums, beside_noise
-from calib.excitation.sums import window_sums
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import Pose, Window
+from calib.windows.bands import band_sums, beside_noise
+from calib.windows.deviations import PROBABILITY, BetweenBands, Deviations, LeftOpen
+from calib.windows.record import Record
+from calib.windows.sums import window_sums
 
 RATE_HZ, WINDOW_S, BAND_HZ = 200.0, 60, (0.5, 12.0)
 POSE = Pose("beside", np.eye(3), np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2]))

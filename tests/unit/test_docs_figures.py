@@ -19,8 +19,8 @@ import pytest
 from scipy import stats
 
 from benchmarks import disturbed, drift_test, guided, one_frequency, site, torture, torture_shm
-from calib.estimate.false_alarms import false_alarm_rate
-from calib.estimate.onsets import FEWEST, SPAN
+from calib.drift.false_alarms import false_alarm_rate
+from calib.drift.onsets import FEWEST, SPAN
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

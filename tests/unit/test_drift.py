@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agent.core.snapshot import pack, unpack
-from calib.estimate.drift import DriftSettings, DriftTest, DriftVerdict
-from calib.estimate.false_alarms import false_alarm_rate, false_alarm_threshold
-from calib.estimate.onsets import CLIP, FEWEST, SPAN, Onsets
+from calib.drift.drift import DriftSettings, DriftTest, DriftVerdict
+from calib.drift.false_alarms import false_alarm_rate, false_alarm_threshold
+from calib.drift.onsets import CLIP, FEWEST, SPAN, Onsets
 from calib.model import PARAMETERS, Array
 
 HOUR_S = 3600.0

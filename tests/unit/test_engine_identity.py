@@ -47,7 +47,7 @@ def sources() -> dict[str, bytes]:
 def test_modules_that_a_replay_loads_are_part_of_the_engine() -> None:
     ran = subprocess.run([sys.executable, "-c", REPLAY, GOLDEN], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = {Path(line).relative_to(ROOT).as_posix() for line in ran.stdout.splitlines()}
-    assert {"agent/core/gate.py", "calib/estimate/state.py", "agent/config/whole.py"} <= loaded
+    assert {"agent/core/gate.py", "calib/state/state.py", "agent/config/whole.py"} <= loaded
     assert loaded - sources().keys() == READER
 
 

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import adjust
-from calib.estimate.condense import condense
+from calib.adjustment.adjustment import adjust
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
 from calib.estimate.rows import Noise
-from calib.estimate.state import State
 from calib.estimate.statements import Statements, Step
-from calib.estimate.thinning import NEWEST, thinned
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.excitation.excited import excited
 from calib.model import Array
+from calib.state.state import State
+from calib.state.thinning import NEWEST, thinned
+from calib.windows.condense import condense
+from calib.windows.excited import excited
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.clamp_windows import ALPHAS_DEG, S_TRUE, TRUTH, Faults, clamp_points
 

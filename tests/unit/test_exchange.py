@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.condense import condense
-from calib.estimate.equations import Equations
+from calib.adjustment.equations import Equations
+from calib.adjustment.slope_scatter import SlopeScatter
 from calib.estimate.nuisances import Applied, Priors
-from calib.estimate.slope_scatter import SlopeScatter
-from calib.excitation.excited import Excitation, excited
-from calib.excitation.sums import window_sums
 from calib.geometry import beside
 from calib.model import Window
+from calib.windows.condense import condense
+from calib.windows.excited import Excitation, excited
+from calib.windows.sums import window_sums
 
 NOISE_MPS2 = 0.001
 S = np.array([[1.01, 0.02, 0.0], [0.0, 0.99, -0.01], [0.03, 0.0, 1.02]])

@@ -10,7 +10,7 @@ import pytest
 from agent.config.gate import DriftOptions, GateSettings
 from agent.core.gate import Answer, Gate
 from agent.core.snapshot import pack, unpack
-from calib.estimate.drift import DriftSettings
+from calib.drift.drift import DriftSettings
 from tests.gate_rules import (
     FAR,
     NEAR,

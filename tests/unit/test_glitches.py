@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.excitation.front_end import Settings, windows_of
 from calib.geometry import along
 from calib.model import Array, Window

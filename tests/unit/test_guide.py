@@ -20,7 +20,7 @@ from agent.delivery.verifying import UnverifiedError
 from agent.monitor import benches as benches_module
 from agent.monitor.benches import Benches
 from agent.recording.signing import Signer
-from calib.estimate.next_stop import Wanted
+from calib.visit.next_stop import Wanted
 from tests.attacks.signed_site import KEY, OTHER, listed
 from tests.unit.zenoh_site import Site, wait_for
 

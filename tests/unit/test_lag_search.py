@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.lag_search import longest_in_time, minima, misfit_by_lag
+from calib.excitation.lag_search import longest_in_time, minima, misfit_by_lag
 
 RATE_HZ, SECONDS, NOISE = 100.0, 40.0, 0.05
 S = np.array([[2.0, 0.02, -0.01], [0.01, 1.9, 0.03], [0.0, 0.02, 2.1]])

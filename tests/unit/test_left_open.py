@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from calib.estimate.adjustment import adjust
-from calib.estimate.condense import condense
-from calib.estimate.deviations import U_CORNER, BetweenBands, LeftOpen
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.excitation.bands import motion_band_hz
-from calib.excitation.excited import excited
 from calib.model import Array
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
 from calib.signal.response import by_term
+from calib.state.state import State
+from calib.windows.bands import motion_band_hz
+from calib.windows.condense import condense
+from calib.windows.deviations import U_CORNER, BetweenBands, LeftOpen
+from calib.windows.excited import excited
+from calib.windows.record import Record
 from tests.pair import Disturbance, Filter, Pair, flat, lowpass, noise, pair, undisturbed
 
 U_REFERENCE = 1e-3

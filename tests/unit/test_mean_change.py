@@ -7,8 +7,8 @@ import pytest
 
 from agent.core.mean_watch import MeanWatch
 from agent.core.watch import Hour
+from calib.drift.mean_change import MeanChange, mean_change
 from calib.estimate.correction import Law, between
-from calib.estimate.mean_change import MeanChange, mean_change
 from calib.model import Array
 from tests.unit.test_watched import Q_TRUE, S_TRUE
 

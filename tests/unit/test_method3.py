@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from calib.excitation.sums import window_sums
 from calib.geometry import along, at_rest, beside, clamp, on_axis
 from calib.model import Pose, Window
 from calib.paper.method3 import fit, solve
+from calib.windows.sums import window_sums
 
 S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
 Q_TRUE = np.array([0.36, -0.06, 0.165])

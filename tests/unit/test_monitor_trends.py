@@ -17,7 +17,7 @@ from agent.monitor.engines import Sqlite
 from agent.monitor.fleet import Fleet, dated
 from agent.monitor.onset import since
 from agent.monitor.trends import Trends, change_in, change_of
-from calib.estimate.state import DATED
+from calib.state.state import DATED
 from tests.unit.results import calibration, status
 
 PLACE = ("site", "gw", "mems")

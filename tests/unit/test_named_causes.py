@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from calib.estimate.mistakes import with_unit
+from calib.adjustment.mistakes import with_unit
 from calib.recorded.errors import InputError, OptionError
 from calib.recorded.notebook import calibrate
 from calib.recorded.outcome import NuisanceValue, Outcome

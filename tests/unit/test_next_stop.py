@@ -12,9 +12,9 @@ from scipy.stats import chi2
 from agent.bench.session import Session
 from agent.bench.stops import on_clamp, on_faces, turned_by_hand
 from benchmarks.guided import AMPLITUDE_MPS2, NOISE_MPS2, OFFSET_MPS2, RATE_HZ, STAY_S, User, priors
-from calib.estimate.next_stop import MAIN, Expected, Joint, Plan, Wanted
-from calib.estimate.stop_order import ALL_SETS, Together
 from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.visit.next_stop import MAIN, Expected, Joint, Plan, Wanted
+from calib.visit.stop_order import ALL_SETS, Together
 
 ANGLE = float(np.deg2rad(0.2))
 ALPHAS_DEG = tuple(range(0, 360, 15))
@@ -100,7 +100,7 @@ def test_the_set_of_stops_is_the_best_of_all():
     together = Together(session.plan, session.joint, session.expected, session.wanted)
     for count, all_sets in ((3, ALL_SETS), (4, 0)):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("calib.estimate.stop_order.ALL_SETS", all_sets)
+            patch.setattr("calib.visit.stop_order.ALL_SETS", all_sets)
             _, found = together.best(range(count))
         costs = []
         for some in itertools.combinations(range(len(TWO[::4])), count):

@@ -10,7 +10,7 @@ import pytest
 from agent.core.noise_watch import FIRST, IN_A_ROW, NoiseWatch
 from agent.core.snapshot import pack, unpack
 from benchmarks.noise import Sound, told
-from calib.estimate.record import Record
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.unit.test_estimation import estimation, hours
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from calib.estimate.nuisances import Priors
-from calib.excitation.bands import band_sums, motion_band_hz
 from calib.excitation.disturbance import NoiseFilter
 from calib.model import BandSums
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
+from calib.windows.bands import band_sums, motion_band_hz
 from tests.pair import Disturbance, Pair, flat, noise, pair, undisturbed
 
 U_REFERENCE = 1e-3

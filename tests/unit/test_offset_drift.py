@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Priors
 from calib.model import Pose, Window
+from calib.site_adjustment.link import Link, link
 from tests.clamp_windows import sums_of
 
 RESTS, SAMPLES, SEGMENTS = 25, 200, 10

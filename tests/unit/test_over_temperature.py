@@ -15,12 +15,12 @@ from agent.export.samples import acceleration
 from benchmarks.online.temperature import Drawn, World, estimation, over_u
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.statements import Statements
-from calib.estimate.thinning import merged
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Pose
+from calib.state.state import State
+from calib.state.thinning import merged
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE
 from tests.drawn_records import UP, Truth, template, told

@@ -7,12 +7,12 @@ import pytest
 
 from calib.estimate.estimate import Estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.past import FURTHEST_DAYS, REACH_DAYS, Past
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.statements import Step
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Array, Pose
+from calib.state.past import FURTHEST_DAYS, REACH_DAYS, Past
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE
 from tests.drawn_records import UP, Truth, template, told

@@ -22,9 +22,9 @@ from agent.delivery.store import Store
 from agent.export.smoothing import Smoothed, date_of
 from agent.report.material import gather
 from calib.estimate.correction import Law
-from calib.estimate.past import Past
 from calib.model import PARAMETERS
 from calib.rounding import rounded
+from calib.state.past import Past
 from tests.unit.recorded_bench import EPOCH_NS, record
 
 RECORDING = "fieldcal-000001.mcap"

@@ -10,8 +10,8 @@ import pytest
 
 from calib.estimate import physics
 from calib.estimate.physics import Stack, Windows, rotation
-from calib.estimate.record import Record
 from calib.model import Pose, Window
+from calib.windows.record import Record
 from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE, sums_of
 
 RATE_HZ, SECONDS = 400.0, 20.0

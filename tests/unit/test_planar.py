@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from agent.core.snapshot import pack, unpack
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel
 from calib.model import Window
 from calib.recorded.notebook import calibrate
 from calib.recorded.outcome import Outcome
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.planar_world import Made, World, calibrated, made
 from tests.unit.test_state import FIXED, MEAN, STILL, U

@@ -11,10 +11,10 @@ import numpy as np
 
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
 from calib.estimate.statements import Statements
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Pose
+from calib.windows.record import Record
 from tests.drawn_records import UP, Truth, template, told
 
 WINDOWS, STEP, U_REFERENCE = 40, 0.01, 0.02

@@ -11,9 +11,9 @@ import pytest
 from agent.config import parse_config, recorded_config
 from agent.config.knowledge import Certificate
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.unit.mounted_site import EPOCH_NS, begun, site_config, updates
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import Adjustment, adjust
+from calib.adjustment.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
 from calib.estimate.reference_share import shared_covariance
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.clamp_windows import Faults, clamp_points
 from tests.unit.test_exchange import HOUR, MEAN, STATED, STEADY, U

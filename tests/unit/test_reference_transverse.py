@@ -11,10 +11,10 @@ import pytest
 from calib import calibrate
 from calib.estimate import physics
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.recorded.outcome import Outcome
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import building_window
 
 RATE_HZ, SECONDS, U_TRANSVERSE, SEEDS = 100.0, 60.0, 0.01, 30

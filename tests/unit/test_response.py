@@ -12,13 +12,13 @@ from click.testing import CliRunner
 
 from agent.cli.calibrate import calibrate
 from calib import calibrate as calibrated_arrays
-from calib.estimate.adjustment import adjust
-from calib.estimate.banded import Factors, _projected
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
-from calib.excitation.bands import band_sums
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
 from calib.signal.response import POWERS, Response, passed
+from calib.windows.banded import Factors, _projected
+from calib.windows.bands import band_sums
 from hw.virtual.bench import Bench
 from hw.virtual.presets import COUNTS_PER_MPS2, plain
 from hw.virtual.schedule import Schedule, clamped

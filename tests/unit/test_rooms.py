@@ -49,11 +49,26 @@ def test_no_text_of_the_library_names_an_option_a_command_or_a_setting_of_the_ag
     assert found == []
 
 
+def test_a_run_loads_neither_virtual_worlds_nor_what_is_done_at_a_desk() -> None:
+    """`fieldcal run` loads all before devices open; import-linter holds the same for what functions import."""
+    code = "import sys, agent.cli.run, agent.acquisition.service, agent.recording.device\nprint(*sorted(sys.modules))"
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = run.stdout.split()
+    assert "agent.core.pipeline" in loaded
+    desk = re.compile(
+        r"hw\.(virtual|conformance)\b"
+        r"|agent\.(bench|calibrate|certificate|export|fleet|monitor|reading|report)\b"
+        r"|calib\.(adjustment|paper|recorded|site_adjustment|site_watch|visit)\b"
+    )
+    assert desk.match("hw.virtual.bench")
+    assert [name for name in loaded if desk.match(name)] == []
+
+
 @pytest.mark.slow
 def test_a_run_loads_nothing_while_devices_are_read() -> None:
     """What numpy loads at the first use of a function costs memory, and time in which no device is read."""
     code = (
-        "import sys, agent.cli.run, agent.acquisition.service\n"
+        "import sys, agent.cli.run, agent.acquisition.service, agent.recording.device\n"
         "from agent.cli.main import run_cli\n"
         "from tests.replay.golden_files import FORMATS, RECORDING\n"
         "before = set(sys.modules)\n"

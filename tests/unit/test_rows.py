@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
 from calib.estimate.rows import Degrees, Noise, Rows
 from calib.estimate.statements import Statements, Step
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Pose
+from calib.windows.record import Record
 from tests.clamp_windows import G_MPS2, frame
 from tests.drawn_records import template
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.long_files import SENSITIVITY, minutes_of, pose_rows
-from calib.excitation.sums import pool, window_sums
 from calib.recorded import segments
 from calib.recorded.calibrating import calibrated
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome
 from calib.recorded.poses import PoseRow, Poses
 from calib.recorded.table import ReferenceTable, SensorTable
+from calib.windows.sums import pool, window_sums
 
 
 @pytest.mark.parametrize(("size", "counts"), [(1, [9] * 7), (3, [27, 36]), (7, [63]), (9, [63])])

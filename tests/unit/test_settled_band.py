@@ -13,9 +13,9 @@ from agent.cli.main import run_cli
 from agent.core.snapshot import pack, unpack
 from benchmarks.online import lorries
 from benchmarks.online.lorries import CALM_HZ, FAST_HZ, after, judged, take, window
-from calib.estimate.over_frequency import common_band
-from calib.estimate.record import WIDER, Record
-from calib.excitation.bands import motion_band_hz
+from calib.state.over_frequency import common_band
+from calib.windows.bands import motion_band_hz
+from calib.windows.record import WIDER, Record
 
 
 def test_motion_that_comes_and_goes_is_no_part_of_the_band_that_lasts() -> None:

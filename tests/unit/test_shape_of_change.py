@@ -9,9 +9,9 @@ import pytest
 
 from agent.core.hypotheses import shape_of_change
 from benchmarks.hypotheses import MEAN, PRIORS, U, limit
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.state.state import State
+from calib.windows.record import Record
 from hw.virtual.schedule import rotation
 from tests.building_windows import building_window
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.contradiction import alternatives, suspects, verdicts
-from calib.estimate.device import Device
-from calib.estimate.link import Link, link
 from calib.estimate.nuisances import Priors
-from calib.estimate.site import Site
+from calib.site_adjustment.contradiction import alternatives, suspects, verdicts
+from calib.site_adjustment.device import Device
+from calib.site_adjustment.link import Link, link
+from calib.site_adjustment.site import Site
 from tests.dense_site import Meeting, SimulatedSite, dense
 
 NOMINAL = np.append(np.eye(3).ravel(), np.zeros(3))

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from calib.model import Array
-from calib.site.day import Day, Hours, day_of
-from calib.site.scatter import Blocks
-from calib.site.steps import PRIOR, TERMS, Steps, inverted
-from calib.site.together import ALL, DIRECTIONS, design, jointly
-from calib.site.verdicts import Result, examined, limit_of, result
-from calib.site.watch import SiteWatch
+from calib.site_watch.day import Day, Hours, day_of
+from calib.site_watch.scatter import Blocks
+from calib.site_watch.steps import PRIOR, TERMS, Steps, inverted
+from calib.site_watch.together import ALL, DIRECTIONS, design, jointly
+from calib.site_watch.verdicts import Result, examined, limit_of, result
+from calib.site_watch.watch import SiteWatch
 
 BANDS_HZ = 10.0 ** (np.arange(0, 6) / 10.0)
 GATEWAY = np.array([0, 0, 0, 1, 1, 1, 2, 2, 2])

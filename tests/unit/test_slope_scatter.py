@@ -7,16 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 
+from calib.adjustment import adjustment
+from calib.adjustment.adjustment import Adjustment, adjust
+from calib.adjustment.slope_scatter import SlopeScatter, estimated
 from calib.distributions import chi2_quantile
-from calib.estimate import adjustment
-from calib.estimate.adjustment import Adjustment, adjust
-from calib.estimate.condense import condense
 from calib.estimate.nuisances import Priors
-from calib.estimate.slope_scatter import SlopeScatter, estimated
-from calib.excitation.excited import excited
-from calib.excitation.sums import window_sums
 from calib.geometry import clamp
 from calib.model import Array, Window
+from calib.windows.condense import condense
+from calib.windows.excited import excited
+from calib.windows.sums import window_sums
 
 RATE_HZ, SECONDS, NOISE = 200.0, 8.0, 0.01
 FREQUENCIES_HZ = np.array([1.3, 2.9, 4.7, 7.1])

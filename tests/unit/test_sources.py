@@ -14,14 +14,14 @@ from agent.core.snapshot import pack, unpack
 from agent.recording.messages import decode, encode, schema_of, topic_of
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
 from calib.estimate.rows import CORRECTION, LAGS, OFFSETS, TYPE_A, Degrees, Noise, Rows
-from calib.estimate.state import State
 from calib.estimate.statements import Statements, Step
-from calib.estimate.thinning import thinned
-from calib.estimate.type_a import LEAST_INFLATION
 from calib.estimate.wander import TemperatureModel
 from calib.model import Array, Calibration
+from calib.state.state import State
+from calib.state.thinning import thinned
+from calib.windows.record import Record
+from calib.windows.type_a import LEAST_INFLATION
 from tests.building_windows import building_window
 from tests.clamp_windows import TRUTH, Faults, clamp_points
 from tests.unit.results import calibration

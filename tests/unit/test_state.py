@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from agent.core.snapshot import pack
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Calibration
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import BESIDE, GRAVITY, building_window
 from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, TRUTH, Faults, clamp_points, sums_of
 

@@ -10,16 +10,16 @@ import pytest
 
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.over_frequency import OverFrequency
-from calib.estimate.record import Record
 from calib.estimate.rows import Degrees, Noise, Rows
-from calib.estimate.state import State
 from calib.estimate.statements import Dated, Statements, Step, Widening
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Calibration, Pose
 from calib.signal.known_response import known_of
 from calib.signal.response import FLAT
+from calib.state.over_frequency import OverFrequency
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.clamp_windows import G_MPS2
 from tests.drawn_records import UP, Truth, template, told
 

@@ -13,7 +13,7 @@ from agent.export.past import SensorPast
 from agent.export.samples import Content, ExportError
 from agent.export.stationxml import Place, write_stationxml
 from calib.estimate.correction import Law
-from calib.estimate.past import Past
+from calib.state.past import Past
 from tests.unit.recorded_bench import EPOCH_NS
 
 pytest.importorskip("obspy", reason="ObsPy is not installed (extra seismic)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.excitation.sums import BLOCK_SAMPLES, factor, merge, pool, window_sums
+from calib.windows.sums import BLOCK_SAMPLES, factor, merge, pool, window_sums
 
 
 def data(n: int, m: int, seed: int = 1, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -9,10 +9,10 @@ import numpy as np
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
 from calib.estimate.statements import Statements
-from calib.estimate.thinning import MOST, merged, thinned
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Pose
+from calib.state.thinning import MOST, merged, thinned
 from tests.drawn_records import UP, Truth, template, told
 
 S, Q = np.eye(3), np.array([0.2, -0.1, 0.4])

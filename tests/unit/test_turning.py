@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.turning import Counts, one
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
 from tests.clamp_windows import clamp_points
 

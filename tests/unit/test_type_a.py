@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.record import Record
 from calib.estimate.rows import Noise
-from calib.estimate.type_a import LEVELS, SUMS, scattered, score_sums
+from calib.windows.record import Record
+from calib.windows.type_a import LEVELS, SUMS, scattered, score_sums
 from tests.building_windows import building_window
 from tests.clamp_windows import S_TRUE
 

@@ -11,10 +11,10 @@ import pytest
 from agent.config import Channel, parse_config
 from agent.core.estimation import Estimation
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Pose, Window
+from calib.state.state import State
+from calib.windows.record import Record
 from tests.building_windows import GRAVITY
 from tests.clamp_windows import Q_TRUE, S_TRUE, window_of
 
@@ -136,7 +136,7 @@ def test_a_direction_known_well_on_a_mount_that_may_lean() -> None:
 
 def test_of_positions_left_long_ago_nothing_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Along gravity a position has unknowns of motion across it, in phase and in quadrature."""
-    monkeypatch.setattr("calib.estimate.state.MOST_POSITIONS", 3)
+    monkeypatch.setattr("calib.state.state.MOST_POSITIONS", 3)
     channel, random = channel_of(MOUNTS["along gravity"]), np.random.default_rng(11)
     prior, stated = channel.prior, pose_of(channel)
     u = prior.standard_uncertainty(prior.mean(None))

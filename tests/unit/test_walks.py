@@ -10,14 +10,14 @@ import pytest
 
 from agent.core.snapshot import pack, unpack
 from benchmarks.walks import STABILITY_PCT, WALK_PCT, Drawn, Life, channel, drawn, lived, none
-from calib.estimate.drift import DriftVerdict
+from calib.drift.drift import DriftVerdict
 from calib.estimate.nuisances import Priors
-from calib.estimate.record import Record
-from calib.estimate.state import State
 from calib.estimate.statements import Widening
-from calib.estimate.walks import Shown, Walks
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
+from calib.state.state import State
+from calib.state.walks import Shown, Walks
+from calib.windows.record import Record
 from tests.building_windows import building_window
 
 SYY, SXY = 4, 1

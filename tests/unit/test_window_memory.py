@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.adjustment import adjust
+from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Priors
-from calib.excitation.bands import TAPER, lowest_hz, motion_band_hz
 from calib.excitation.windows import Points, motion_windows
 from calib.geometry import beside
 from calib.model import Window
 from calib.recorded.segments import with_joined
+from calib.windows.bands import TAPER, lowest_hz, motion_band_hz
 
 RATE_HZ, LENGTH_S = 1000.0, 60.0
 JOINED = 6  # segments, as in a day

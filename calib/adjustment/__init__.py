@@ -1,0 +1,1 @@
+"""The adjustment of files: S, Q and all nuisances from all windows at once. Begin with `adjustment.py`."""

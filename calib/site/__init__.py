@@ -1,2 +1,0 @@
-"""The sensors of a site that have no reference, watched together: which one's sensitivity changes, and which change
-is the structure's. docs/site-watch.md says how; `calib.site.watch.SiteWatch` is where to begin."""

@@ -1,0 +1,1 @@
+"""All sensors and references of a site in one adjustment, and who contradicts the others. Begin with `site.py`."""

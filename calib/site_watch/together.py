@@ -1,0 +1,132 @@
+"""What the steps of all channels at one day say together: which sensor's sensitivity changed, or which way it turned.
+
+A step of a channel of sensor i in band b is  lambda_b + G_ib theta_i + what belongs to this band alone.  lambda is
+the same for all sensors: the level is free, so a change that all sensors share is not seen. theta are relative
+changes of the sensitivity of x, y, z and small turns about x, y, z; G is 1 for a sensitivity in its own amplitudes,
+and for turns follows from the co-spectra M of the sensor: a turn changes M by W M + M W^T, with W the matrix of a
+small rotation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.model import Array
+from calib.site_watch.day import PAIRS
+
+# What is tested of each sensor: one sensitivity, all three alike, a turn about one axis; in terms of theta.
+DIRECTIONS = np.array(
+    [[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0],
+     [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=float,
+)  # fmt: skip
+SENSITIVITIES, ALL = slice(0, 4), 3
+REJECT = 6.0  # standard uncertainties from which a sensor or channel does not say what is common (Tukey's biweight)
+ROUNDS = 4
+LARGEST_RATIO = 10.0  # of the amplitudes of two axes, for the cross power to tell of a turn
+
+
+def design(value: Array, level: Array) -> Array:
+    """G (n, B, 6, 6) from the mean of the channels (n, B, 6) and levels (B, 3); 0 where a channel is not known."""
+    amplitude = value[..., :3] + level
+    ratio = np.clip(amplitude[..., :, None] - amplitude[..., None, :], -np.log(LARGEST_RATIO), np.log(LARGEST_RATIO))
+    cross = np.clip(np.nan_to_num(value[..., 3:]), -1.0, 1.0)
+    rho = np.zeros((*value.shape[:2], 3, 3))
+    rho[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    for c, (j, k) in enumerate(zip(*PAIRS, strict=True)):
+        rho[..., j, k] = rho[..., k, j] = cross[..., c]
+    # N_jl = M_lk / (a_j a_k): what a part of axis l in output j makes of the normalised co-spectrum j, k
+    G = np.zeros((*value.shape[:2], 6, 6))
+    G[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    share = np.exp(np.nan_to_num(-ratio))  # (.., j, l): amplitude of l over that of j
+    for w in range(3):
+        W = np.zeros((3, 3))
+        W[(w + 1) % 3, (w + 2) % 3], W[(w + 2) % 3, (w + 1) % 3] = 1.0, -1.0
+        mixed = np.einsum("jl,nbjl,nblk->nbjk", W, share, rho)  # (W M)_jk / (a_j a_k)
+        G[..., :3, 3 + w] = amplitudes = mixed[..., [0, 1, 2], [0, 1, 2]]
+        for c, (j, k) in enumerate(zip(*PAIRS, strict=True)):
+            G[..., 3 + c, 3 + w] = (
+                mixed[..., j, k] + mixed[..., k, j] - rho[..., j, k] * (amplitudes[..., j] + amplitudes[..., k])
+            )
+    return np.where(np.isfinite(value)[..., None], G, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joint:
+    """For each begin (k): `size`, `u` (k, n, 7): the change in each of DIRECTIONS by itself. `rest` (k, n, B, 6):
+    steps without what is common; `information` (k, n, B, 6): of these, over the variance."""
+
+    size: Array
+    u: Array
+    rest: Array
+    information: Array
+
+    @property
+    def statistic(self) -> Array:
+        """The change over its standard uncertainty."""
+        return self.size / self.u
+
+
+def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: Array) -> Joint:
+    """All sensors at once, robustly: what a few sensors do differently does not move what is common.
+
+    `step`, `information` (k, n, B, 6); `inflation` (k, n, 7): variance of each direction over what independent
+    channels have; `walk` (k,): standard uncertainty by which a sensitivity may have changed by itself.
+    """
+    common, others = _common(step[..., :3], information[..., :3], np.sqrt(inflation[..., ALL]))
+    # Each sensor against the others alone: its own part in what is common is taken out.
+    rest, alone = step.copy(), information.copy()
+    rest[..., :3] = np.where(others > 0.0, step[..., :3] - common, 0.0)
+    both = information[..., :3] + others
+    alone[..., :3] = information[..., :3] * others / np.where(both > 0.0, both, 1.0)
+    score, squares = scores(rest, alone, G)
+    known = squares > 0.0
+    squares = np.where(known, squares, 1.0)
+    variance = np.where(known, inflation / squares, np.inf)
+    return Joint(np.where(known, score / squares, 0.0), np.sqrt(variance + walk[:, None, None] ** 2), rest, alone)
+
+
+def scores(values: Array, information: Array, G: Array) -> tuple[Array, Array]:
+    """Sum of g I r and of g I g over the channels of each sensor, for each direction: (..., n, 7) each."""
+    n, channels = len(G), G.shape[1] * G.shape[2]
+    g = (G @ DIRECTIONS.T).reshape(n, channels, len(DIRECTIONS))
+    flat = (*information.shape[:-3], n, 1, channels)
+    weighted = information.reshape(flat)
+    return (weighted * values.reshape(flat) @ g)[..., 0, :], (weighted @ np.square(g))[..., 0, :]
+
+
+def _common(y: Array, info: Array, scale: Array) -> tuple[Array, Array]:
+    """What all other sensors share of the amplitudes, for each sensor (k, n, B, 3), and its information.
+
+    Iteratively reweighted: a sensor whose bands differ alike, or a channel that differs by itself, loses its weight.
+    """
+    root, scale = np.sqrt(info), scale[:, :, None, None]
+    axis = np.sqrt(np.maximum(info.sum(axis=2, keepdims=True), 1e-300)) * scale
+    whole = np.sqrt(np.maximum(info.sum(axis=(2, 3), keepdims=True), 1e-300)) * scale
+    common = median(np.where(info > 0.0, y, np.nan), axis=1)
+    for _ in range(ROUNDS):
+        away = y - common[:, None]
+        score = info * away
+        sensor = np.abs(score.sum(axis=2, keepdims=True)) / axis
+        alike = np.abs(score.sum(axis=(2, 3), keepdims=True)) / whole
+        weight = info * biweight(np.maximum(sensor, alike)) * biweight(away * root / scale)
+        sums, total = np.sum(weight * y, axis=1), np.sum(weight, axis=1)
+        common = np.where(total > 0.0, sums / np.where(total > 0.0, total, 1.0), common)
+    others = total[:, None] - weight
+    others = np.where(others > 1e-9 * total[:, None], others, 0.0)
+    return (sums[:, None] - weight * y) / np.where(others > 0.0, others, 1.0), others
+
+
+def median(values: Array, axis: int) -> Array:
+    """Median along an axis without NaN; 0 where there is nothing."""
+    ordered = np.sort(values, axis=axis)  # NaN come last
+    number = np.isfinite(values).sum(axis=axis, keepdims=True)
+    low, high = np.maximum(number - 1, 0) // 2, np.minimum(number // 2, values.shape[axis] - 1)
+    both = np.take_along_axis(ordered, low, axis) + np.take_along_axis(ordered, high, axis)
+    return np.where(number > 0, 0.5 * both, 0.0).squeeze(axis)
+
+
+def biweight(z: Array) -> Array:
+    """Weight of what lies `z` standard deviations away (Tukey): 1 at 0, 0 from REJECT on."""
+    return np.square(np.maximum(1.0 - np.square(z / REJECT), 0.0))

@@ -1,0 +1,299 @@
+"""What the watch of a site says today: a verdict for each sensor and gateway, with size, U and date, and what cannot
+be seen.
+
+One step at an unknown time is asked for (a drift appears as a step that begins in its middle). The tests of all
+sensors, directions, gateways, noise floors and times share one rate of false alarms, by Bonferroni's inequality.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.distributions import NORMAL, student_quantile
+from calib.model import Array
+from calib.site_watch.steps import PRIOR_DEGREES, TERMS
+from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, Joint, jointly, median
+from calib.site_watch.watch import SiteWatch, pooled
+
+FALSE_ALARMS_PER_YEAR = 0.5  # of a whole site, at most, where the model of the scatter holds
+LOOKS_PER_YEAR = 1000.0  # independent looks of a test: a new one each day for steps of a few days, fewer for older ones
+FEWEST_DAYS = 21  # that teach the norm of a sensor
+FEWEST_SINCE = 3  # days after a step, before it is told
+WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk after a day: 0.06 % in a year
+COVERAGE = 2.0
+# Factor of u for what the norm does not fit over seasons; from the sound sites of benchmarks/site_watch.py.
+MISFIT = 1.15
+ALIKE = 0.1  # of a change: how far its bands may differ by themselves
+FEWEST_BANDS = 3  # for bands to be called alike
+NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
+         "turn about x", "turn about y", "turn about z")  # fmt: skip
+MONTH_DAYS = 30  # after a change, of which the least detectable one is told
+LONGEST_DAYS = 365  # of the norm, over which the walk counts
+LEAST_VARIANCE = 0.2  # of a channel's variance, that a step leaves
+EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told apart (2 standard deviations)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """A verdict of a sensor or gateway.
+
+    `kind`: none, learning, sensitivity, turn, noise, structure, sensor or structure, gateway. `what`: in words.
+    `size`, `U`: relative change of the sensitivity (of the amplitude of the noise), or angle in rad; expanded by
+    COVERAGE. `since`, `earliest`, `latest`: days since 1970. `statistic`: size over its standard uncertainty, or a
+    normal equivalent.
+    """
+
+    kind: str
+    what: str = ""
+    size: float = 0.0
+    U: float = np.inf
+    since: int = -1
+    earliest: int = -1
+    latest: int = -1
+    statistic: float = 0.0
+
+
+NOTHING = Told("none")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Result:
+    """The verdicts of a site on day `day`.
+
+    `sensors` (n), `gateways` {number: verdict}, `site`. `least_detectable` (n, 3): relative change of the
+    sensitivity of x, y, z that is found 30 days after it in half of the cases. `days` (n,): days that teach the
+    norm. `seen_degc` (n, 2): range of temperature in the norm. `outside`: today's temperature is beyond what the
+    sensor's norm has seen. `common`: change that all sensors share, against those beside a reference; None without
+    such. `hidden`: a common change below this size is not seen (relative).
+    """
+
+    day: int
+    sensors: list[Told]
+    gateways: dict[int, Told]
+    site: Told
+    least_detectable: Array
+    days: Array
+    seen_degc: Array
+    outside: NDArray[np.bool_]
+    common: Told | None
+    hidden: float
+    limit: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tests:
+    """The joint test at each begin of a step (k,). `apart` (k, n): do the bands of a sensor change differently, as a
+    normal deviate; `bands` (k, n): that tell of a sensor."""
+
+    begins: list[int]
+    joint: Joint
+    apart: Array
+    bands: Array
+
+    def dated(self, squared: Array) -> tuple[int, tuple[int, int, int]]:
+        """Index of the likeliest begin; its day, and the first and last day that are not told apart from it."""
+        best = int(np.argmax(squared))
+        near = np.flatnonzero(squared >= squared[best] - EVIDENCE_DROP)
+        first, last = int(near[0]), int(near[-1])  # between these and the next begins none is kept
+        earliest = self.begins[first - 1] + 1 if first else self.begins[0]
+        latest = self.begins[last + 1] - 1 if last + 1 < len(self.begins) else self.begins[last]
+        return best, (self.begins[best], earliest, latest)
+
+
+def limit_of(sensors: int, gateways: int, per_year: float = FALSE_ALARMS_PER_YEAR) -> float:
+    """Standard deviations that no sound test may exceed, with `per_year` false alarms of the whole site."""
+    tests = sensors * (len(DIRECTIONS) + 1 + 3) + gateways
+    return -NORMAL.inv_cdf(0.5 * per_year / (tests * LOOKS_PER_YEAR))
+
+
+def result(watch: SiteWatch, known_u: Array | None = None) -> Result:
+    """The verdicts of today. `known_u` (n,): relative standard uncertainty of the sensitivity of each sensor that
+    stands beside a reference; inf or NaN for the others."""
+    n = watch.shape[0]
+    anchored = np.zeros(n, dtype=bool) if known_u is None else np.isfinite(known_u)
+    limit = limit_of(n, len(set(watch.gateway.tolist())))
+    days = watch.steps.days.reshape(watch.shape).max(axis=(1, 2))
+    sensors = [NOTHING if d >= FEWEST_DAYS + FEWEST_SINCE else Told("learning") for d in days]
+    gateways: dict[int, Told] = {}
+    site, common, least = NOTHING, None, np.full((n, 3), np.inf)
+    tests = examined(watch)
+    if tests is not None:
+        noise = _noise(watch, limit)
+        for i in range(n):
+            if sensors[i].kind == "none" and not anchored[i]:
+                sensors[i] = _sensor(tests, i, limit, noise[i])
+        gateways = _gateways(watch, tests, sensors, limit)
+        site = _structure(tests, sensors)
+        if known_u is not None and anchored.any():
+            common = _common_change(tests, known_u[anchored], anchored)
+        month = int(np.argmin([abs(watch.day - begin + 1 - MONTH_DAYS) for begin in tests.begins]))
+        least = limit * tests.joint.u[month, :, :3]
+    outside = (watch.degc < watch.seen_degc[:, 0]) | (watch.degc > watch.seen_degc[:, 1])
+    hidden = common.U if common is not None else np.inf
+    return Result(
+        watch.day, sensors, gateways, site, least, days, watch.seen_degc.copy(), outside, common, hidden, limit
+    )
+
+
+def examined(watch: SiteWatch) -> Tests | None:
+    """The joint test at all begins with enough days before and since; None where there is none."""
+    begins, shape = watch.steps.begins, watch.shape
+    which = [k for k, begin in enumerate(begins)
+             if watch.day - begin + 1 >= FEWEST_SINCE and begin - begins[0] >= FEWEST_DAYS]  # fmt: skip
+    if not which:
+        return None
+    size, information, since = (part.reshape(-1, *shape) for part in watch.steps.step(which))
+    days, variance = watch.steps.days.reshape(shape), watch.variance()
+    counts = (since >= FEWEST_SINCE) & (days - since >= FEWEST_DAYS)
+    information = np.where(counts, information / _without(variance, size, information, days), 0.0)
+    ages = np.array([watch.day - begins[k] + 1 for k in which], dtype=float)
+    before = np.minimum([begins[k] - begins[0] for k in which], LONGEST_DAYS)
+    walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
+    inflation = MISFIT**2 * watch.days_scatter.over(watch.day, [begins[k] for k in which])
+    joint = jointly(size, information, watch.G, inflation, walk)
+    apart = _apart(joint, watch.G)
+    bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
+    return Tests([begins[k] for k in which], joint, apart, bands)
+
+
+def _without(variance: Array, size: Array, information: Array, days: Array) -> Array:
+    """The variance without what a step explains: the step is no scatter."""
+    freedom = np.maximum(days, 1.0) + PRIOR_DEGREES
+    return np.asarray(np.maximum(variance - size**2 * information / freedom, LEAST_VARIANCE * variance))
+
+
+def _apart(joint: Joint, G: Array) -> Array:
+    """How much the bands of each sensor differ from any change of its sensitivities and any turn, (k, n).
+
+    What most sensors show, such as days that the norm does not fit, is taken as scatter.
+    """
+    n, channels = len(G), G.shape[1] * G.shape[2]
+    g = G.reshape(n, channels, -1)
+    r, info = joint.rest.reshape(-1, n, channels), joint.information.reshape(-1, n, channels)
+    normal = np.swapaxes(g, 1, 2) @ (info[..., None] * g)
+    trace = np.trace(normal, axis1=-2, axis2=-1)
+    normal += (1e-9 * trace + 1e-12)[..., None, None] * np.eye(g.shape[-1])
+    right = ((info * r)[..., None, :] @ g)[..., 0, :]
+    fitted = (g @ np.linalg.solve(normal, right[..., None]))[..., 0]
+    own = info / (1.0 + info * np.square(ALIKE * fitted))
+    squares = np.sum(own * np.square(r - fitted), axis=-1)
+    freedom = np.sum(info > 0.0, axis=-1) - g.shape[-1]
+    f = np.maximum(freedom, 1).astype(float)
+    site = median(np.where(freedom > 0, squares / f, np.nan), axis=1)
+    ratio = squares / f / (MISFIT * np.maximum(site, 1.0))[:, None]
+    deviate = (np.cbrt(ratio) - (1.0 - 2.0 / (9.0 * f))) / np.sqrt(2.0 / (9.0 * f))
+    return np.asarray(np.where(freedom > 0, deviate, -np.inf))
+
+
+def _sensor(tests: Tests, i: int, limit: float, noise: Told) -> Told:
+    """The verdict of one sensor by itself."""
+    statistic, apart = tests.joint.statistic[:, i], tests.apart[:, i]
+    direction = int(np.argmax(np.abs(statistic).max(axis=0)))
+    best, dates = tests.dated(statistic[:, direction] ** 2)
+    z = abs(float(statistic[best, direction]))
+    if apart.max() > limit and (z <= limit or apart[best] > limit):
+        worst, dates = tests.dated(np.maximum(apart, 0.0) ** 2)
+        return Told("sensor or structure", "its bands change differently", 0.0, np.inf, *dates, float(apart[worst]))
+    if z > limit:
+        kind = "sensitivity" if direction <= ALL else "turn"
+        kind = kind if tests.bands[best, i] >= FEWEST_BANDS else "sensor or structure"
+        size, u = tests.joint.size[best, i, direction], tests.joint.u[best, i, direction]
+        return Told(kind, NAMES[direction], float(size), COVERAGE * float(u), *dates, z)
+    return noise
+
+
+def _noise(watch: SiteWatch, limit: float) -> list[Told]:
+    """Has the noise floor of an output changed? For each sensor."""
+    steps, shape = watch.noise, (watch.shape[0], 3)
+    which = [k for k, begin in enumerate(steps.begins) if watch.day - begin + 1 >= FEWEST_SINCE]
+    size, information, since = (part.reshape(-1, *shape) for part in steps.step(which))
+    days = steps.days.reshape(shape)
+    counts = (since >= FEWEST_SINCE) & (days - since >= FEWEST_DAYS) & (information > 0.0)
+    without = _without(pooled(*steps.rest(), shape), size, information, days)
+    grown = watch.noise_scatter.over(watch.day, [steps.begins[k] for k in which])
+    u = np.sqrt(without * grown / np.where(counts, information, 1.0))
+    z = np.where(counts, np.abs(size) / u, 0.0)
+    told = []
+    for i in range(shape[0]):
+        k, axis = np.unravel_index(int(np.argmax(z[:, i])), (len(which), 3))
+        begin, factor = steps.begins[which[k]], float(np.exp(size[k, i, axis]))
+        found = Told("noise", f"noise of {'xyz'[axis]}", factor - 1.0, COVERAGE * float(u[k, i, axis]) * factor,
+                     begin, begin, begin, float(z[k, i, axis]))  # fmt: skip
+        few = student_quantile(NORMAL.cdf(limit), float(days[i, axis]) - TERMS + PRIOR_DEGREES)
+        told.append(found if found.statistic > few else NOTHING)
+    return told
+
+
+def _gateways(watch: SiteWatch, tests: Tests, sensors: list[Told], limit: float) -> dict[int, Told]:
+    """All sensors of a gateway alike, against the median of all gateways. A sensor that its gateway explains is not
+    told."""
+    numbers, index = np.unique(watch.gateway, return_inverse=True)
+    told: dict[int, Told] = {}
+    if len(numbers) < 2:
+        return told
+    mean, u, fits = _means(tests.joint, index)
+    pair = len(numbers) == 2
+    what = "the two gateways differ; which of them changed is not seen" if pair else "all its sensors alike"
+    for g, number in enumerate(numbers.tolist()[: 1 if pair else None]):
+        own = index == g
+        best, dates = tests.dated(np.square(mean[:, g] / u[:, g]))
+        z = abs(float(mean[best, g] / u[best, g]))
+        alone = np.abs(tests.joint.statistic[best, own, SENSITIVITIES]).max()
+        if z > max(limit, alone) and fits[best, g] and own.sum() > 1:
+            told[number] = Told("gateway", what, float(mean[best, g]), COVERAGE * float(u[best, g]), *dates, z)
+    for i, verdict in enumerate(sensors):
+        if verdict.kind == "sensitivity" and told and (pair or int(watch.gateway[i]) in told):
+            sensors[i] = NOTHING
+    return told
+
+
+def _means(joint: Joint, index: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    """Mean change of the sensors of each gateway against the median of the gateways (k, g), its u, and whether its
+    sensors agree. Of two gateways: their difference."""
+    s, weight = joint.size[:, :, ALL], 1.0 / np.square(joint.u[:, :, ALL])
+    member = np.eye(index.max() + 1)[index]  # (n, g)
+    total = weight @ member
+    mean = np.where(total > 0.0, (weight * s) @ member / np.where(total > 0.0, total, 1.0), np.nan)
+    variance = np.where(total > 0.0, 1.0 / np.where(total > 0.0, total, 1.0), np.inf)
+    pair = mean.shape[1] == 2
+    centre = mean[:, 1] if pair else median(mean, axis=1)
+    others = variance[:, 1] if pair else np.pi / 2.0 / np.maximum(total.sum(axis=1), 1e-300)
+    away = np.abs(s - np.nan_to_num(mean) @ member.T)
+    reach = np.maximum(4.0 * joint.u[:, :, ALL], 0.3 * np.abs(np.nan_to_num(mean - centre[:, None]) @ member.T))
+    wrong = ((away > reach) & (weight > 0.0)) @ member
+    return np.nan_to_num(mean - centre[:, None]), np.sqrt(variance + others[:, None]), wrong == 0.0
+
+
+def _structure(tests: Tests, sensors: list[Told]) -> Told:
+    """Damage: bands change differently at several sensors, or at most of them."""
+    own = [i for i, told in enumerate(sensors) if told.kind == "sensor or structure"]
+    if len(own) >= 2:
+        apart = np.maximum(tests.apart[:, own].max(axis=1), 0.0)
+        best, dates = tests.dated(apart**2)
+        z = float(apart[best])
+        for i, told in enumerate(sensors):  # what is weaker than the damage may follow from it
+            if told.kind in ("sensitivity", "turn") and told.statistic < z:
+                sensors[i] = NOTHING
+        for i in own:
+            what = "its bands change differently, as those of other sensors do"
+            sensors[i] = Told("structure", what, 0.0, np.inf, *dates, sensors[i].statistic)
+        return Told("structure", f"bands change differently at {len(own)} sensors", 0.0, np.inf, *dates, z)
+    return NOTHING
+
+
+def _common_change(tests: Tests, known_u: Array, anchored: Array) -> Told:
+    """What the sensors without a reference share, seen from those that have one: these change by known_u at most."""
+    s, u = tests.joint.size[:, anchored, ALL], tests.joint.u[:, anchored, ALL]
+    weight = 1.0 / (np.square(u) + 2.0 * np.square(known_u))
+    total = weight.sum(axis=1)
+    some = total > 0.0
+    total = np.where(some, total, 1.0)
+    mean, u_mean = -np.sum(weight * s, axis=1) / total, np.where(some, 1.0 / np.sqrt(total), np.inf)
+    best, dates = tests.dated(np.square(mean / u_mean))
+    z = abs(float(mean[best] / u_mean[best]))
+    return Told(
+        "common", "all sensors without a reference", float(mean[best]), COVERAGE * float(u_mean[best]), *dates, z
+    )

@@ -1,0 +1,186 @@
+"""The watch of a site: takes one day after another, and keeps what is needed to ask which sensor changed, and when.
+
+`update(day)` changes the state, `calib.site_watch.verdicts.result(watch)` reads it. Nothing depends on a clock; the
+same days give the same state, and a watch that is loaded from a snapshot goes on as the original.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array
+from calib.site_watch.day import Day
+from calib.site_watch.scatter import Blocks
+from calib.site_watch.steps import HUBER, PRIOR_DEGREES, TERMS, Steps
+from calib.site_watch.together import DIRECTIONS, biweight, design, scores
+
+ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
+FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, or its residual to count
+FEWEST_SENSORS = 3  # with a band, for its common level to be taken out
+CHANNELS = 6
+WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
+
+
+class SiteWatch:
+    """Sensors 0 to n - 1 in bands `band_hz`; `gateway` (n,): a number of the gateway of each sensor."""
+
+    def __init__(self, gateway: Array, band_hz: Array) -> None:
+        self.gateway, self.band_hz = np.asarray(gateway, dtype=np.int64), np.asarray(band_hz, dtype=float)
+        self.shape = len(self.gateway), len(self.band_hz), CHANNELS
+        self.day = -1
+        self.steps = Steps(int(np.prod(self.shape)))
+        self.noise = Steps(self.shape[0] * 3)
+        self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)))
+        self.band_scatter = Blocks(self.shape, lags=(1, 7))
+        self.noise_scatter = Blocks((self.shape[0], 3))
+        self.origin = np.full((self.shape[1], 3), np.nan)  # levels of the first day
+        self.seen_degc = np.tile([np.inf, -np.inf], (self.shape[0], 1))
+        self.degc = np.nan  # of the last day
+        self.G = np.zeros((*self.shape, CHANNELS))
+
+    def update(self, day: Day, visited: Array | None = None) -> None:
+        """Take a day. `visited` (n,): sensors whose calibration changed in it; their norm begins anew after it.
+
+        Raises ValueError if the day is not later than the one before.
+        """
+        if day.number <= self.day:
+            raise ValueError(f"day {day.number} comes after day {self.day}")
+        if visited is not None and np.any(visited):
+            self._restart(np.asarray(visited, dtype=bool))
+        self.day, self.degc = day.number, day.temperature_degc
+        there = np.isfinite(day.value)
+        if visited is not None:
+            there &= ~np.asarray(visited, dtype=bool)[:, None, None]
+        x = self._regressors(day)
+        value = np.where(there, day.value, 0.0)
+        weight = np.where(there, 1.0 / np.square(day.u), 0.0)
+        expected, u2 = self.steps.expected(x)
+        residual = value - expected.reshape(self.shape)
+        left = self.steps.days.reshape(self.shape) - TERMS
+        known = there & (left >= FEWEST_LEFT)
+        variance = self.variance() * (1.0 / np.where(there, weight, 1.0) + u2.reshape(self.shape))
+        information = np.where(known, 1.0 / variance, 0.0)
+        common = _common(residual[..., :3], information[..., :3])
+        residual[..., :3] -= common
+        value[..., :3] -= common
+        z = residual * np.sqrt(information)
+        self._scatter(z, information)
+        weight *= np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9))
+        self.steps.update(day.number, x, value.ravel(), weight.ravel())
+        self.days_scatter.remember(self.steps.begins)
+        self._noise(day)
+        self._seen(there.sum(axis=(1, 2)) > 0)
+        mean = self.steps.beta[0].reshape(self.shape)
+        self.G = design(np.where(self.steps.days.reshape(self.shape) > 0, mean, np.nan), np.nan_to_num(self.origin))
+
+    def variance(self) -> Array:
+        """Variance of the channels (n, B, 6) over what their noise gives, with dependence over a week.
+
+        A channel's own, drawn to the median of all sensors in its band as by PRIOR_DEGREES days.
+        """
+        own = pooled(*self.steps.rest(), self.shape)
+        blocks = self.band_scatter
+        enough = blocks.count[WEEK] + PRIOR_DEGREES
+        week = (blocks.squares[WEEK] + PRIOR_DEGREES * blocks.inflation()[WEEK]) / enough
+        return np.asarray(own * np.maximum(week, 1.0))
+
+    def snapshot(self) -> dict[str, Any]:
+        """All state as plain arrays, in dictionaries."""
+        parts = {name: getattr(self, name).snapshot() for name in _PARTS}
+        own = {name: np.copy(getattr(self, name)) for name in ("gateway", "band_hz", "day", *_OWN)}
+        return {**own, **parts}
+
+    @classmethod
+    def loaded(cls, told: dict[str, Any]) -> SiteWatch:
+        """The watch of a snapshot."""
+        watch = cls(told["gateway"], told["band_hz"])
+        watch.day, watch.degc = int(told["day"]), float(told["degc"])
+        for name in ("origin", "seen_degc", "G"):
+            setattr(watch, name, told[name].copy())
+        for name in _PARTS:
+            getattr(watch, name).load(told[name])
+        return watch
+
+    def _restart(self, visited: Array) -> None:
+        channels = np.broadcast_to(visited[:, None, None], self.shape).ravel()
+        self.steps.restart(channels)
+        self.seen_degc[visited] = np.inf, -np.inf
+
+    def _regressors(self, day: Day) -> Array:
+        """(TERMS, channels): 1, temperature, its square, the level of the band against the site's, the site's level.
+
+        For a cross power the third is the level of its first axis against that of its second.
+        """
+        fresh = np.isnan(self.origin) & np.isfinite(day.level)
+        self.origin[fresh] = day.level[fresh]
+        away = day.level - self.origin
+        whole = float(np.mean(away[np.isfinite(away)])) if np.isfinite(away).any() else 0.0
+        away = np.nan_to_num(away)
+        degrees = np.nan_to_num((day.temperature_degc - ORIGIN_DEGC) / SCALE_K)
+        x = np.empty((TERMS, *self.shape[1:]))
+        x[0], x[1], x[2], x[4] = 1.0, degrees, degrees**2, whole
+        x[3] = np.column_stack([away - whole, away[:, [0, 0, 1]] - away[:, [1, 2, 2]]])
+        return np.repeat(x[:, None], self.shape[0], axis=1).reshape(TERMS, -1)
+
+    def _scatter(self, z: Array, information: Array) -> None:
+        """What this day says of the scatter: by channel, and by direction of each sensor."""
+        there = information > 0.0
+        self.band_scatter.update(z, there)
+        clipped = np.where(there, np.clip(z, -HUBER, HUBER), 0.0) / np.sqrt(np.where(there, information, 1.0))
+        score, squares = scores(clipped, information, self.G)
+        known = squares > 0.0
+        self.days_scatter.update(score / np.sqrt(np.where(known, squares, 1.0)), known)
+
+    def _noise(self, day: Day) -> None:
+        """The noise floors are followed as the channels are, without a level."""
+        value = day.log_noise.ravel()
+        there = np.isfinite(value)
+        x = np.zeros((TERMS, len(value)))
+        x[0] = 1.0
+        x[1] = np.nan_to_num((day.temperature_degc - ORIGIN_DEGC) / SCALE_K)
+        expected, u2 = self.noise.expected(x)
+        s2 = pooled(*self.noise.rest(), (self.shape[0], 3)).ravel()
+        z = (np.nan_to_num(value) - expected) / np.sqrt(s2 * (1.0 + u2))
+        known = there & (self.noise.days - TERMS >= FEWEST_LEFT)
+        self.noise_scatter.update(z.reshape(-1, 3), known.reshape(-1, 3))
+        weight = there * np.where(known, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)), 1.0)
+        self.noise.update(day.number, x, np.nan_to_num(value), weight)
+        self.noise_scatter.remember(self.noise.begins)
+
+    def _seen(self, told: NDArray[np.bool_]) -> None:
+        if np.isfinite(self.degc):
+            self.seen_degc[told, 0] = np.minimum(self.seen_degc[told, 0], self.degc)
+            self.seen_degc[told, 1] = np.maximum(self.seen_degc[told, 1], self.degc)
+
+
+_OWN = ("origin", "seen_degc", "degc", "G")
+_PARTS = ("steps", "noise", "days_scatter", "band_scatter", "noise_scatter")
+
+
+def pooled(left: Array, freedom: Array, shape: tuple[int, ...]) -> Array:
+    """Variance of each channel from its own days, drawn to the median of all sensors as by PRIOR_DEGREES days."""
+    left, freedom = left.reshape(shape), freedom.reshape(shape)
+    own = np.where(freedom >= FEWEST_LEFT, left / np.maximum(freedom, 1.0), np.nan)
+    middle = np.ones(shape[1:])
+    known = np.isfinite(own).any(axis=0)
+    middle[known] = np.nanmedian(own[:, known], axis=0)
+    return np.asarray((left + PRIOR_DEGREES * middle) / (freedom + PRIOR_DEGREES))
+
+
+def _common(residual: Array, information: Array) -> Array:
+    """What all sensors share in a band and axis on this day (B, 3): a median, then Tukey's biweight."""
+    there = information > 0.0
+    enough = there.sum(axis=0) >= FEWEST_SENSORS
+    common = np.zeros(enough.shape)
+    if not enough.any():
+        return common
+    common[enough] = np.nanmedian(np.where(there, residual, np.nan)[:, enough], axis=0)
+    for _ in range(2):
+        weight = information * biweight((residual - common) * np.sqrt(information))
+        total = weight.sum(axis=0)
+        mean = np.sum(weight * residual, axis=0) / np.where(total > 0.0, total, 1.0)
+        common = np.where(enough & (total > 0.0), mean, common)
+    return common

@@ -1,0 +1,134 @@
+"""Old records are merged: many windows of one setting become one record, which tells the same of all that is constant.
+
+A walk within the merged stretch is allowed for in the record's weight (calib.estimate.rows). Nothing is merged across a
+step, nor what differs in setting, in the directions that moved or in the response that the front end took out; lags are
+brought to one. A record without a temperature stays apart from those that have one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import reduce
+
+import numpy as np
+
+from calib.model import Array
+from calib.windows.deviations import Deviations, LeftOpen
+from calib.windows.excited import Motion
+from calib.windows.record import TERMS, TOLD, Record
+
+NEWEST = 48  # records that stay as they are: four times round twelve positions
+# (age in days from which on, width in days): an hour for two weeks, then longer ones.
+WIDTHS = ((0.0, 1.0 / 24.0), (14.0, 1.0), (60.0, 7.0), (400.0, 14.0), (1200.0, 30.0))
+MOST = 650  # records: 2 MB with three axes of a reference. Of many positions and references the widths are doubled
+WIDEST = 4096.0  # times the widths
+BRIEF_DAYS = 1.0  # so long Q is the same at all temperatures of a record
+BIN_K = 5.0  # records whose temperatures differ by more stay apart: S may depend on it
+
+
+def thinned(records: Sequence[Record], now: float, nominal: Array, cuts: Sequence[float] = ()) -> list[Record]:
+    """The records, in the order of their days, the old ones merged as WIDTHS says.
+
+    `nominal` (3, 3) is S, only to bring the means of V to one mean of the reference's motion. `cuts`: days of steps.
+    """
+    records = sorted(records, key=lambda r: r.day)
+    old, new = records[:-NEWEST], records[-NEWEST:]
+    wider, buckets = 1.0, _buckets(old, now, cuts, 1.0)
+    while len(buckets) + len(new) > MOST and wider < WIDEST:
+        wider *= 2.0
+        buckets = _buckets(old, now, cuts, wider)
+    return sorted((merged(own, nominal) for own in buckets), key=lambda r: r.day) + new
+
+
+def _buckets(records: Sequence[Record], now: float, cuts: Sequence[float], wider: float) -> list[list[Record]]:
+    """The records that become one each, with so many times the widths."""
+    found: dict[tuple[object, ...], list[Record]] = {}
+    for r in records:
+        width = wider * max(width for age, width in WIDTHS if now - r.day >= age or age == 0.0)
+        degc = np.floor(r.temperature_degc / BIN_K) if np.isfinite(r.temperature_degc) else None
+        key = (
+            width, int(r.day // width), sum(r.day >= day for day in cuts), r.setting, r.excited.tobytes(), r.response,
+            degc, r.motion_hz is None, r.planar,
+        )  # fmt: skip
+        found.setdefault(key, []).append(r)
+    return list(found.values())
+
+
+def merged(records: Sequence[Record], nominal: Array) -> Record:
+    """One record for several of one setting and response."""
+    if len(records) == 1:
+        return records[0]
+    first, m2 = records[0], 2 * records[0].channels
+    windows = np.array([float(r.windows) for r in records])
+    share = windows / windows.sum()
+
+    def mean(name: str) -> Array:
+        return np.asarray(sum(w * getattr(r, name) for w, r in zip(share, records, strict=True)))
+
+    noise = np.sqrt(sum(w * r.noise**2 for w, r in zip(share, records, strict=True)))
+    root, slopes, passed = _stacked(records, noise, m2)
+    mean_x = mean("mean_x")
+    D = first.pose.direction
+    # The means of V at one mean of the reference: its own motion moves them by S as nearly as nominal.
+    moved = [r.means - np.outer(r.over_t[:, 0], nominal @ D @ (r.mean_x - mean_x)[: D.shape[1]]) for r in records]
+    days = min(r.days[0] for r in records), max(r.days[1] for r in records)
+    # Over weeks Q drifts with the seasons, and the temperature within them would take it up: the mean alone is kept.
+    rows = 3 if days[1] - days[0] <= BRIEF_DAYS else 1
+    over = _triangle(np.hstack([np.vstack([r.over_t for r in records]), np.vstack(moved)]), rows)
+    power = np.array([(r.root[:, : r.channels] ** 2).sum() for r in records]) + np.finfo(float).tiny
+    deviations, left_open = Deviations(), LeftOpen()
+    motions = [r.motion for r in records if r.motion is not None]
+    for r in records:
+        deviations, left_open = deviations.plus(r.deviations), left_open.plus(r.left_open)
+    return replace(
+        first,
+        day=float(share @ [r.day for r in records]),
+        days=days, windows=int(windows.sum()),
+        u_lag_s=_rms(share, [r.u_lag_s for r in records]), attenuation=_rms(share, [r.attenuation for r in records]),
+        independent=float(share @ [r.independent for r in records]), along=mean("along"),
+        along_rate_s=mean("along_rate_s"), root=root, slopes=slopes, passed=passed,
+        omega2=float(power @ [r.omega2 for r in records] / power.sum()), noise=noise,
+        scores=np.asarray(sum(r.scores for r in records)),
+        mean_x=mean_x, means=over[:, 3:], over_t=over[:, :3],
+        temperature_degc=float(power @ [r.temperature_degc for r in records] / power.sum()),
+        behind_k=float(power @ [r.behind_k for r in records] / power.sum()), held_mps2=mean("held_mps2"),
+        count=float(sum(r.count for r in records)), told=_triangle(np.vstack([r.told for r in records]), TOLD),
+        deviations=deviations, left_open=left_open, mean_hz=float(share @ [r.mean_hz for r in records]),
+        motion=reduce(Motion.plus, motions) if motions else None,
+        to_hz=max(r.to_hz for r in records), bands=None, reference_noise=None,
+    )  # fmt: skip
+
+
+def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, Array, Array]:
+    """R, R b and R P of all together.
+
+    A window's rows count by its own noise, as if all had the noise of the merged one.
+    """
+    half, lag_s = m2 // 2, records[0].lag_s
+    by = [float(np.sqrt(np.mean(noise**2 / r.noise**2))) for r in records]
+    wide = np.vstack([
+        b * np.hstack([r.root, r.slopes_at_lag(lag_s), r.passed.transpose(1, 0, 2).reshape(m2, -1)])
+        for b, r in zip(by, records, strict=True)
+    ])  # fmt: skip
+    live = np.abs(wide[:, :m2]).max(axis=0, initial=0.0) > 0.0
+    triangle = np.asarray(np.linalg.qr(np.hstack([wide[:, :m2][:, live], wide[:, m2:]]), mode="r"))
+    k, found = int(live.sum()), np.zeros((m2, wide.shape[1]))
+    found[np.ix_(live, live)], found[live, m2:] = triangle[:k, :k], triangle[:k, k:]
+    passed = found[:, m2 + 3 :].reshape(m2, TERMS, half).transpose(1, 0, 2)
+    return found[:, :m2], found[:, m2 : m2 + 3], passed
+
+
+def _triangle(rows: Array, most: int) -> Array:
+    """The first rows of the R factor, `most` of them, in which columns of zeros stay so."""
+    found = np.zeros((min(most, len(rows)), rows.shape[1]))
+    live = np.abs(rows).max(axis=0, initial=0.0) > 0.0
+    if live.any():
+        triangle = np.asarray(np.linalg.qr(rows[:, live], mode="r"))[:most]
+        found = np.zeros((len(triangle), rows.shape[1]))
+        found[:, live] = triangle
+    return found
+
+
+def _rms(share: Array, values: Sequence[float]) -> float:
+    return float(np.sqrt(share @ np.square(values)))

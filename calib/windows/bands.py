@@ -1,0 +1,229 @@
+"""Sums of a window in bands of frequency, beside its sums over time (calib.windows.sums).
+
+Two instruments respond alike at one frequency only. The sums of a band tell the slopes of V on u and on du/dt in that
+band. u, du/dt and V are tapered alike, so that a linear relation between them stays what it is. By Parseval's theorem
+the sums of all bands together are the centred sums over time of the tapered window.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array, BandSums, Window, own_channels
+from calib.signal.band import hanning
+from calib.signal.order_statistics import distinct, median
+from calib.signal.response import Complex
+
+BANDS_AN_OCTAVE = 6
+HANN = 0.5
+TAPER = 0.1  # of the window, at each end: longer than the impulse response of any filter of an instrument
+MORE_LINES = 6  # in a band, beside those that the regression on u and du/dt uses; a band with fewer joins the next one
+FEWEST_BANDS = 4
+RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a direction was not excited
+# A band is used if the motion is so many times the reference's noise, in power: the correction leaves a tenth of it.
+OVER_NOISE = 100.0
+# A response is told by motion that has so large a share of its power in so many third octaves.
+LEAST_SHARE, FEWEST_THIRDS = 1e-2, 4
+LEAST_SHOWN = 0.25  # of V in a band, by the motion: with less, the reference's noise may look like motion
+HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is rounded
+LASTS = 0.25  # of its mean power that a band has for half of the time: with less, its motion comes and goes
+BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
+
+
+def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPER) -> BandSums | None:
+    """Band sums of evenly sampled u (n, m) in m/s2, du (n, m) in m/s3 and V (n, 3) in output unit.
+
+    `share` of the window is tapered at each end. With HANN motion that is much stronger at other frequencies does not
+    leak into a band; the sums then have the weight of half of the points. u may hold the integrals of a reference as
+    well (calib.signal.corner). None where the window is too short for a few bands, and without a reference.
+    """
+    n, m = u.shape
+    fewest = 2 * own_channels(m) + MORE_LINES
+    if not m or n < 2 * FEWEST_BANDS * fewest:
+        return None
+    taper, density = _taper(n, share)
+    rows = np.vstack([u.T, du.T, V.T])
+    rows -= (rows @ taper / taper.sum())[:, None]
+    rows *= taper
+    lines = np.fft.rfft(rows, axis=1)[:, 1:]
+    frequency_hz: Array = np.fft.rfftfreq(n, 1.0 / rate_hz)[1:].astype(np.float64)
+    edges = _edges(frequency_hz, fewest)
+    own = [lines[:, a:b] for a, b in itertools.pairwise(edges.tolist())]
+    products = np.array([(part @ part.conj().T).real for part in own])
+    ends_hz = np.append(frequency_hz, 0.5 * rate_hz)[edges]
+    nothing, moved = np.zeros((len(products), 2 * m + 3)), own_channels(m)
+    lasting = np.array([_lasting(part[:moved]) for part in own])
+    return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing, lasting)
+
+
+def _lasting(lines: Complex) -> float:
+    """The median over time of the power of a band, over its mean. `lines` (m, L) are those of the motion in the band;
+    their envelope has one point for each line. The power of noise has a median of 0.7 to 0.9 times its mean, a sine has
+    1, and bumps that take a small part of the time have almost nothing (scipy/scipy pull request 8970 averages spectra
+    so)."""
+    power = np.sum(np.abs(np.fft.ifft(lines * hanning(lines.shape[1] + 2)[1:-1], axis=1)) ** 2, axis=0)
+    return float(median(power) / max(power.mean(), np.finfo(float).tiny))
+
+
+def parts(bands: BandSums, kept: NDArray[np.bool_] | slice) -> BandSums:
+    """Some of the bands."""
+    names = ("low_hz", "high_hz", "points", "products", "noise", "lasting")
+    return replace(bands, **{name: getattr(bands, name)[kept] for name in names})
+
+
+def beside_noise(bands: BandSums, sensor_noise: Array) -> BandSums:
+    """The same bands with the white noise of V: `sensor_noise` (3,) is its rms of a point: 0 where nobody knows it,
+    inf where all noise that is not the reference's white noise is V's."""
+    noise = bands.noise.copy()
+    noise[:, -3:] = bands.points[:, None] * sensor_noise**2
+    return replace(bands, noise=noise)
+
+
+def without_integrals(bands: BandSums) -> BandSums:
+    """The bands of the reference's own channels, without their integrals (calib.signal.corner)."""
+    channels, m = bands.reference_channels, own_channels(bands.reference_channels)
+    if channels == m:
+        return bands
+    kept = np.r_[0:m, channels : channels + m, 2 * channels : 2 * channels + 3]
+    products = bands.products[:, kept[:, None], kept]
+    return replace(bands, reference_channels=m, products=products, noise=bands.noise[:, kept])
+
+
+def without_noise(bands: BandSums, noise: Array) -> BandSums:
+    """The bands with motion, the power of the reference's white noise subtracted.
+
+    `noise` (2, m): its rms in u and du/dt. Their ratio tells up to which frequency it is.
+    """
+    m, channels, total = noise.shape[1], bands.reference_channels, float(bands.points.sum())
+    power = np.zeros_like(bands.noise)
+    power[:, -3:] = bands.noise[:, -3:]
+    kept = np.ones(len(power), dtype=bool)
+    own = bands.products.diagonal(axis1=1, axis2=2)
+    moved, moved_rate = own[:, :m].sum(axis=1), own[:, channels : channels + m].sum(axis=1)
+    for k in np.flatnonzero(noise[0] > 0.0):
+        end_hz = np.sqrt(3.0) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
+        low, high = np.minimum(bands.low_hz, end_hz), np.minimum(bands.high_hz, end_hz)
+        power[:, k] = total * noise[0, k] ** 2 * (high - low) / end_hz
+        power[:, channels + k] = total * noise[1, k] ** 2 * (high**3 - low**3) / end_hz**3
+        kept &= (moved > OVER_NOISE * power[:, k]) & (moved_rate > OVER_NOISE * power[:, channels + k])
+        kept &= bands.high_hz <= end_hz
+    products = bands.products.copy()
+    products[:, range(2 * channels), range(2 * channels)] -= power[:, : 2 * channels]
+    return parts(replace(bands, products=products, noise=power), kept)
+
+
+@lru_cache(maxsize=4)
+def _taper(n: int, share: float) -> tuple[Array, float]:
+    """A cosine taper (n,) with mean square 1, and the share of the points that it leaves independent."""
+    ramp = max(int(share * n), 1)
+    taper = np.ones(n)
+    taper[:ramp] = 0.5 - 0.5 * np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp)
+    taper[n - ramp :] = taper[:ramp][::-1]
+    taper /= np.sqrt(np.mean(taper**2))
+    taper.flags.writeable = False
+    return taper, float(1.0 / np.mean(taper**4))
+
+
+def _edges(frequency_hz: Array, fewest: int) -> NDArray[np.int64]:
+    """Numbers of the lines at which bands begin, and the number of lines; each band has `fewest` lines or more."""
+    octave = np.floor(BANDS_AN_OCTAVE * np.log2(frequency_hz / frequency_hz[0])).astype(np.int64)
+    starts = [0]
+    for k in (np.flatnonzero(np.diff(octave)) + 1).tolist():
+        if k - starts[-1] >= fewest:
+            starts.append(k)
+    if len(starts) > 1 and len(frequency_hz) - starts[-1] < fewest:
+        starts.pop()
+    return np.array([*starts, len(frequency_hz)])
+
+
+def share_above(bands: BandSums | None, to_hz: float) -> float:
+    """The share of a window's motion, in power, that is above a frequency; 0 where the window has no `bands`.
+
+    The power of a band is taken to be even over it: a band that hardly reaches above the frequency hardly counts.
+    """
+    if bands is None:
+        return 0.0
+    m = own_channels(bands.reference_channels)
+    power = np.trace(bands.products[:, :m, :m], axis1=1, axis2=2)
+    part = ((bands.high_hz - to_hz) / (bands.high_hz - bands.low_hz)).clip(0.0, 1.0)
+    return float(power @ part / max(power.sum(), np.finfo(float).tiny))
+
+
+def motion_band_hz(windows: Sequence[Window], *, lasting: bool = False) -> tuple[float, float] | None:
+    """The band in Hz of the motion of all windows. None where no window has bands, or where the motion is in a few
+    narrow bands only (sines), which cannot tell a response over frequency. `lasting`: of a band in which the motion
+    comes and goes, only the power counts that is there for half of the time."""
+    bands = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
+    if not bands:
+        return None
+    low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
+    each = [_powers(b, lasting=lasting) for b in bands]
+    power, square = (np.concatenate(part) for part in zip(*each, strict=True))
+    if not power.sum() > 0.0:
+        return None
+    third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(np.int64)
+    shares = np.array([power[third == k].sum() for k in distinct(third)]) / power.sum()
+    if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
+        return None
+    below, above = _narrowed(low, high, power, square)
+    surely_low = max(_end(b.low_hz, b.low_hz, own, BELOW) for b, (own, _) in zip(bands, each, strict=True))
+    surely_high = min(_end(b.high_hz, -b.high_hz, own, ABOVE) for b, (own, _) in zip(bands, each, strict=True))
+    low_hz, high_hz = _end(below, below, power, BELOW), _end(above, -above, power, ABOVE)
+    return min(low_hz, surely_low), max(high_hz, surely_high)
+
+
+def lowest_hz(windows: Sequence[Window]) -> float:
+    """The frequency at which the motion of windows with bands begins, also if it begins within a wide band."""
+    bands = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
+    low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
+    power, square = (np.concatenate(part) for part in zip(*map(_powers, bands), strict=True))
+    below, _ = _narrowed(low, high, power, square)
+    return _end(below, below, power, BELOW)
+
+
+def _narrowed(low_hz: Array, high_hz: Array, power: Array, square: Array) -> tuple[Array, Array]:
+    """The ends of bands, nearer to their motion in a wide band of a short window: the derivative tells its frequency.
+
+    `power` is that of the motion, `square` that of its derivative.
+    """
+    mean_hz = np.sqrt(np.divide(square, power, out=np.zeros_like(power), where=power > 0.0)) / (2.0 * np.pi)
+    wide, mean_hz = 2.0 ** (1.0 / BANDS_AN_OCTAVE), np.clip(mean_hz, low_hz, high_hz)
+    return np.maximum(low_hz, mean_hz / wide), np.minimum(high_hz, mean_hz * wide)
+
+
+def _end(edge: Array, order: Array, power: Array, outside: float) -> float:
+    """The edge of the first band, in rising order, up to which more than the share `outside` of the power lies."""
+    sequence = np.argsort(order)
+    share = np.cumsum(power[sequence]) / max(power.sum(), np.finfo(float).tiny)
+    return float(edge[sequence][min(int(np.searchsorted(share, outside)), len(edge) - 1)])
+
+
+def _powers(bands: BandSums, *, lasting: bool = False) -> tuple[Array, Array]:
+    """The power of the motion and of its derivative, in each band of a window; 0 in bands that are incoherent.
+    `lasting` as in motion_band_hz."""
+    bands = without_integrals(bands)
+    m, powers = bands.reference_channels, np.diagonal(bands.products, axis1=1, axis2=2)
+    power, square = powers[:, :m].sum(axis=1), powers[:, m : 2 * m].sum(axis=1)
+    if lasting:
+        share = np.where(bands.lasting < LASTS, bands.lasting, 1.0)
+        power, square = share * power, share * square
+    seen = _coherent(bands)
+    return np.where(seen, power, 0.0), np.where(seen, square, 0.0)
+
+
+def _coherent(bands: BandSums) -> NDArray[np.bool_]:
+    """(B,) whether the motion explains at least LEAST_SHOWN of V in a band, at any lag."""
+    m, products = bands.reference_channels, bands.products
+    x, V, both = products[:, : 2 * m, : 2 * m], products[:, 2 * m :, 2 * m :], products[:, : 2 * m, 2 * m :]
+    unit = np.sqrt(np.where((own := np.diagonal(x, axis1=1, axis2=2)) > 0.0, own, 1.0))
+    both, x = both / unit[:, :, None], x / (unit[:, :, None] * unit[:, None])
+    total = np.trace(V, axis1=1, axis2=2)
+    told = np.sum(both * np.linalg.solve(x + RELATED * np.eye(2 * m), both), axis=(1, 2))
+    rest = (total - told) * bands.points / (bands.points - 2.0 * m)
+    return np.asarray(rest <= (1.0 - LEAST_SHOWN) * total)

@@ -1,0 +1,225 @@
+"""Type A: how much slopes and means of a window scatter, from segment to segment, pooled over all windows.
+
+Residuals are not white (AR(1) 0.99: the true uncertainty is 11 times the white one), so a segment's residual sums
+(its scores) are the unit that scatters; the correlation of neighbouring segments is taken into account as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.model import Array
+from calib.windows.sums import NOISE_FLOOR
+
+Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
+Index = NDArray[np.intp]
+
+# Correlation of neighbours above which segments are joined in pairs: they are shorter than 3 correlation times.
+RHO_COARSEN = 0.35
+FEWEST_FREEDOM = 10.0  # degrees of freedom: from fewer, a mean of squares is off by 40 % and more
+LEAST_INFLATION = 0.25  # variance ratios below it are the luck of few segments
+LEVELS = 6  # segments are joined in pairs so often at most: half a second becomes sixteen
+FEWEST_SEGMENTS = 4.0  # of a window, on average, that are still joined
+SINGULAR = 1e-9
+SUMS = 10  # numbers for each level, see `score_sums`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segments:
+    """Sums of W windows of K segments each, about one centre for each window.
+
+    `at` (W,): which windows they are. Counts (W, K), x x' (W, K, 2M, 2M), x V' (W, K, 2M, 3), V V' (W, K, 3, 3), sums
+    of [x, V] (W, K, 2M + 3); `mean` (W, 2M + 3) is that centre. `noise` (W, 2M): power a sample of the reference's own
+    noise, which is no longer in xx but still in the residuals. `independent` (W,): share of points that a filter left
+    independent.
+    """
+
+    at: Index
+    count: Array
+    xx: Array
+    xv: Array
+    vv: Array
+    total: Array
+    mean: Array
+    noise: Array
+    independent: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TypeA:
+    """How much slopes and means scatter.
+
+    `noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
+    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were what a filter makes of
+    white noise, independent between axes. `degrees_of_freedom` of both, inf where single segments allow no estimate.
+    `known`: how far segments tell it, 1 where they are enough; else the rest is what a filter makes of white noise.
+    `scores` (2, LEVELS, SUMS): the sums of both from which this follows.
+    """
+
+    noise: Array
+    slopes: Array
+    means: Array
+    degrees_of_freedom: float
+    known: float
+    scores: Array
+
+    def slope_ratio(self, live: Flags) -> float:
+        """Variance of the slopes over that of white noise, mean over those with data (`live`, 6M)."""
+        return float(np.diag(self.slopes)[live].mean())
+
+
+def in_order(parts: Sequence[Segments], values: Sequence[Array]) -> Array:
+    """Values (W, ...) of the windows of each part, in the order of all windows."""
+    if len(parts) == 1:  # they are in order already
+        return values[0]
+    return np.concatenate(values)[np.argsort(np.concatenate([part.at for part in parts]))]
+
+
+def pooled(
+    parts: Sequence[Segments], roots: Sequence[Array], whiteners: Sequence[Array], *, alike: bool = False
+) -> TypeA:
+    """Scatter of the whitened scores over all windows; slopes are whitened by T = `whiteners` (W, 2M, 2M) of each part.
+
+    `alike`: all windows are taken to be as noisy as their mean, so that all points weigh the same (Method 3).
+    """
+    slopes = [np.swapaxes(t, 1, 2) @ (t @ part.xv.sum(1)) for t, part in zip(whiteners, parts, strict=True)]
+    noise = in_order(parts, [_noise(*each) for each in zip(parts, slopes, roots, strict=True)])
+    # Scores are summed in one unit. Each in units of its own window's noise would seem too small: it made that noise.
+    count = in_order(parts, [part.count.sum(1) for part in parts])
+    sd = np.sqrt(count @ noise**2 / count.sum())
+    if alike:
+        noise = np.tile(sd, (len(noise), 1))
+    size = roots[0].shape[-1]
+    slope_scores, mean_scores = [], []
+    for part, beta, t in zip(parts, slopes, whiteners, strict=True):
+        unit = (sd / np.sqrt(part.independent)[:, None])[:, None]
+        score = np.einsum("wrc,wkci->wkri", t, part.xv - part.xx @ beta[:, None]) / unit[:, :, None]
+        slope_scores.append(score.reshape(*part.count.shape, 3 * size))
+        score = (part.total[..., -3:] - part.total[..., :-3] @ beta) / unit
+        mean_scores.append(score / np.sqrt(part.count.sum(1))[:, None, None])
+    live = np.repeat(np.any([np.any(np.diagonal(r, axis1=1, axis2=2) > 0.0, axis=0) for r in roots], axis=0), 3)
+    slope_cov, of_slopes, sums = _scatter(slope_scores, live)
+    mean_cov, of_means, mean_sums = _scatter(mean_scores, np.ones(3, dtype=bool))
+    found = [own for own in (of_slopes, of_means) if own is not None]
+    freedom = min((own.degrees_of_freedom for own in found), default=np.inf)
+    known = min((own.known for own in found), default=0.0)
+    return TypeA(noise, slope_cov, mean_cov, freedom, known, np.array([sums, mean_sums]))
+
+
+def _noise(part: Segments, slopes: Array, root: Array) -> Array:
+    """(W, 3) SD of the residuals of the windows with these slopes."""
+    count, xv, vv = part.count.sum(1), part.xv.sum(1), np.diagonal(part.vv.sum(1), axis1=1, axis2=2)
+    xx = part.xx.sum(1) + count[:, None, None] * part.noise[:, None] * np.eye(part.noise.shape[1])
+    left = vv - 2.0 * np.einsum("wci,wci->wi", slopes, xv) + np.einsum("wci,wcd,wdi->wi", slopes, xx, slopes)
+    signal = vv + count[:, None] * part.mean[:, -3:] ** 2
+    freedom = count - 1.0 - np.count_nonzero(np.diagonal(root, axis1=1, axis2=2), axis=1)
+    floor = NOISE_FLOOR * np.sqrt(signal.max(axis=1) / count)
+    spread = np.sqrt(np.maximum(left, 0.0) / np.maximum(freedom, 1.0)[:, None])
+    return np.asarray(np.maximum(spread, np.where(floor > 0.0, floor, 1.0)[:, None]))
+
+
+def _scatter(scores: list[Array], live: Flags) -> tuple[Array, Scattered | None, Array]:
+    """Covariance (D, D) of a window's summed scores, what it rests on, and `score_sums`; `live` (D,) are those with
+    data.
+
+    `scores` (W, K, D) of windows with K segments each.
+    """
+    sums = score_sums([s[..., live] for s in scores])
+    found = scattered(sums)
+    if found is None:
+        return np.eye(len(live)), None, sums
+    for _ in range(found.level):
+        scores = [_paired(s) for s in scores]
+    covariance = np.sum([s.shape[1] * _flat(s).T @ _flat(s) for s in scores], axis=0) / sums[found.level, 0]
+    return covariance * found.inflation, found, sums
+
+
+@dataclass(frozen=True, slots=True)
+class Scattered:
+    """How much scores scatter: the `variance` of a window's sum of them, over that of white noise, of segments joined
+    `level` times; it has the `inflation` by which neighbours that correlate make it larger. `freedom`: segments less
+    one, of all windows."""
+
+    level: int
+    variance: float
+    inflation: float
+    freedom: float
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the variance. With that of a score and twice the covariance of neighbours, gamma0 + 2 gamma1, it scatters
+        as a mean of squares of a third of the segments: of n white scores 2 (1 + 2) / n in the place of 2 / n, with
+        gamma1 / gamma0 = 0.3 little less (Bartlett's formula)."""
+        return self.freedom / 3.0 if self.inflation > 1.0 else self.freedom
+
+    @property
+    def known(self) -> float:
+        """How far segments tell the variance, 1 where they are enough."""
+        return min(self.freedom / FEWEST_FREEDOM, 1.0)
+
+
+def score_sums(scores: Sequence[Array]) -> Array:
+    """(LEVELS, SUMS) what scores (W, K, D) of windows tell of their scatter. Those of other windows add to them.
+
+    For segments as they are, and joined in pairs once, twice, ...: degrees of freedom, windows, segments, W D, and the
+    mean square of a sum of scores; of windows with three segments and more also what a score's variance and the
+    covariance of two neighbours contribute to the last two numbers, the sums of squares and of products of neighbours.
+    """
+    found = np.zeros((LEVELS, SUMS))
+    for own in found:
+        for s in scores:
+            w, k, d = s.shape
+            square = k * float(np.vdot(s, s)) / max(d, 1)
+            own[:5] += w * (k - 1.0), w, w * k, w * d, square
+            if k > 2:
+                # With r = g - mean(g), E sum r_k^2 and E sum r_k r_k+1 are linear in both.
+                neighbours = (k - 1.0) * (1.0 - 2.0 * (k + 1.0) / k**2) + 2.0 / k
+                product = k * float(np.vdot(s[:, 1:], s[:, :-1])) / max(d, 1)
+                own[5:] += w * (k - 1.0), w * (k - 1.0) / k, w * neighbours, square, product
+        scores = [_paired(s) for s in scores]
+    return found
+
+
+def scattered(sums: Array) -> Scattered | None:
+    """What `score_sums` (LEVELS, SUMS) say; None where single segments allow no estimate."""
+    for level, (freedom, windows, segments, dimensions, total, own, ends, neighbours, square, product) in enumerate(
+        sums.tolist()
+    ):
+        if freedom < 1.0 or not dimensions:
+            return None
+        # own gamma0 - 2 ends gamma1 = square, neighbours gamma1 - ends gamma0 = product
+        variance, determinant = total / freedom, own * neighbours - 2.0 * ends**2
+        if abs(determinant) < SINGULAR:
+            return Scattered(level, variance, 1.0, freedom)
+        gamma0 = (neighbours * square + 2.0 * ends * product) / determinant
+        gamma1 = (ends * square + own * product) / determinant
+        if gamma0 <= 0.0:
+            return Scattered(level, variance, 1.0, freedom)
+        rho, typical = gamma1 / gamma0, segments / windows
+        if rho > RHO_COARSEN and typical >= FEWEST_SEGMENTS and level + 1 < len(sums):
+            continue
+        if rho <= 1.0 / np.sqrt(freedom * dimensions / windows):  # within its own SD of none at all
+            return Scattered(level, variance, 1.0, freedom)
+        naive = gamma0 - 2.0 * gamma1 / typical  # what the variance above expects, neighbours being correlated
+        inflation = max(1.0, (gamma0 + 2.0 * (1.0 - 1.0 / typical) * gamma1) / naive)
+        return Scattered(level, variance * inflation, inflation, freedom)
+    raise AssertionError("the last level is never joined again")
+
+
+def _flat(scores: Array) -> Array:
+    return scores.reshape(-1, scores.shape[-1])
+
+
+def _paired(scores: Array) -> Array:
+    """Neighbours (W, K, D) summed; an odd last one goes with the pair before it, a single one stays."""
+    if scores.shape[1] < 2:
+        return scores
+    even = scores[:, : scores.shape[1] // 2 * 2]
+    pairs = np.asarray(even.reshape(len(even), even.shape[1] // 2, 2, even.shape[2]).sum(2))
+    if even.shape[1] < scores.shape[1]:
+        pairs[:, -1] += scores[:, -1]
+    return pairs
