@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from agent import __version__
-
-if TYPE_CHECKING:
-    from agent.certificate.content import Certificate
+from agent.certificate.content import Certificate
 
 PREFIX = {"fieldcal": "https://fieldcal.invalid/", "sha256": "urn:hash:sha256:"}  # .invalid: nothing is there
 CALIBRATION, SOFTWARE = "fieldcal:calibration", "fieldcal:program"

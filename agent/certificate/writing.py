@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from agent.certificate.content import Certificate, as_object
+from agent.certificate.content import Certificate
 from agent.certificate.dcc import dcc
 from agent.certificate.html import page
+from agent.certificate.making import as_object
 from agent.certificate.pdf import pdf
 from agent.certificate.schema import check_schema
 from agent.certificate.signing import Signer, as_json

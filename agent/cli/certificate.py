@@ -62,7 +62,8 @@ def make(
         raise click.UsageError("--x509-key and --x509-certificate must be given together")
     if not drawable():
         return 1
-    from agent.certificate.content import CertificateError, certificate_of
+    from agent.certificate.content import CertificateError
+    from agent.certificate.making import certificate_of
     from agent.certificate.schema import SchemaError
     from agent.certificate.stating import gather_statements
     from agent.certificate.writing import write

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.certificate.content import as_object, certificate_of
+from agent.certificate.making import as_object, certificate_of
 from agent.certificate.statements import Statements
 from agent.cli.main import run_cli
 from agent.config.reading import load_model

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.certificate.content import Certificate, as_object, certificate_of
+from agent.certificate.content import Certificate
 from agent.certificate.dcc import dcc
+from agent.certificate.making import as_object, certificate_of
 from agent.certificate.signing import Signer
 from agent.certificate.statements import Statements
 from agent.certificate.wording import before_results, parameters
