@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from agent.calibrate.faults import with_dashes
 from agent.terminal.text import one_line, say
 from calib.model import Window
-from calib.recorded.outcome import NuisanceValue, Outcome
+from calib.recorded.measurement_result import NuisanceValue
+from calib.recorded.outcome import Outcome
 from calib.recorded.told import lines_of
 
 

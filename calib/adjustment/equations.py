@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from calib.adjustment.slope_scatter import SlopeScatter
 from calib.estimate import physics
-from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.physics import Windows
+from calib.estimate.terms import Nuisances
 from calib.model import Array, Pose
 from calib.windows.condense import Condensed
 from calib.windows.never_turned import never_turned

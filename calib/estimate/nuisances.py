@@ -1,4 +1,4 @@
-"""The nuisances: unknowns other than S and Q (angles, offsets, the reference, gravity, lag), each with a stated prior.
+"""The priors of the nuisances: unknowns other than S and Q (angles, offsets, the reference, gravity, lag).
 
 calib.estimate.terms has the effect of each nuisance on the inputs of a window, calib.estimate.physics what these do.
 Stated directions and gravity are those of Eqs. 9-11 on the clamp. Transverse motion that a uniaxial reference does not
@@ -7,13 +7,12 @@ measure is in phase with the motion or 90 deg ahead of it; a table that rocks ca
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
-from calib.estimate import physics
 from calib.estimate.quantities import (
     LAG,
     PRIORS,
@@ -24,11 +23,9 @@ from calib.estimate.quantities import (
     Stated,
     Statement,
 )
-from calib.estimate.terms import terms
-from calib.model import Array, Pose, scale_of
+from calib.model import Array, scale_of
 from calib.signal.known_response import UNKNOWN, KnownResponse
-from calib.signal.response import ALL_POWERS, FLAT, NO_MOTION, Response, ResponseModel, by_term
-from calib.windows.deviations import ByAxis, LeftOpen
+from calib.signal.response import FLAT, NO_MOTION, Response, ResponseModel
 
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
 # It is honest for filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
@@ -169,71 +166,3 @@ class Applied:
             SENSOR_CORNER: (self.sensor_corner_hz,),
             RESPONSE: self.response.terms,
         }
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Inputs:
-    """The inputs in P poses at given values of the nuisances: `direction` D (P, 3, M) of the motion; `gravity` G (P, 3)
-    and `offset` (P, 3) in m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s."""
-
-    direction: Array
-    gravity: Array
-    offset: Array
-    lag_s: Array
-    reference_corner: float
-    sensor_corner: float
-
-
-class Nuisances:
-    """The J nuisances of P poses whose uncertainty is not 0: `effect` (P, SIZE, J) of one unit of each on the inputs of
-    a window (calib.estimate.physics), an offset in m/s2; `response` (J, K) on the terms of the response."""
-
-    def __init__(
-        self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied, reference: str = ""
-    ) -> None:
-        """`reference` is the identity of the reference; see calib.estimate.terms."""
-        self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
-        self.direction = np.array([physics.padded(pose.direction, channels) for pose in poses])
-        self.gravity = np.nan_to_num([pose.gravity_mps2 for pose in poses])  # 0 in a pose whose gravity is not known
-        self.effect = np.zeros((len(poses), physics.SIZE, len(self.terms)))
-        for j, term in enumerate(self.terms):
-            self.effect[:, :, j] = term.on_inputs(len(poses))
-        self.response = self.effect[0, physics.RESPONSE, :].T[:, : priors.response_model.powers]
-        self._corners = [
-            np.array([0.0 if corner is None else corner[0] for corner in own])
-            for own in ([t.reference_corner for t in self.terms], [t.sensor_corner for t in self.terms])
-        ]
-        # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
-        self.reference_frequency_hz, self._known_size = priors.reference_frequency_hz, priors.known_size
-        at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
-        self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_model.powers)[0].real
-        self.applied_response = np.array([t.applied for t in self.terms]) @ self.response
-
-    def __len__(self) -> int:
-        return len(self.terms)
-
-    @property
-    def uncertainty(self) -> Array:
-        """(J,) prior standard uncertainties."""
-        return np.array([t.uncertainty for t in self.terms])
-
-    def steady(self, z: Array) -> Array:
-        """(...,) the sensitivity at 0 Hz over that at the reference frequency at the values `z` (..., J)."""
-        return np.asarray(
-            np.exp(-((self.applied_response + z @ self.response) @ self._at_reference + self._known_size))
-        )
-
-    def by_axis(self, z: Array, left_open: LeftOpen) -> ByAxis:
-        """The effect of axes that do not respond quite alike, at the values `z` (J,) of the nuisances."""
-        terms, powers = self.applied_response + z @ self.response, ALL_POWERS[: len(self._at_reference)]
-        return left_open.by_axis(terms, self._at_reference, powers)
-
-    def at(self, z: Array) -> Inputs:
-        """The inputs when the nuisances have the values `z` (J,), or (..., J): then all have these dimensions in
-        front."""
-        p = (self.effect @ z[..., None, :, None])[..., 0]
-        reference, sensor = (z @ corner for corner in self._corners)
-        return Inputs(
-            physics.felt_motion(p, self.direction), physics.felt_gravity(p, self.gravity), p[..., physics.Q],
-            p[..., 0, physics.LAG], reference, sensor,
-        )  # fmt: skip

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from calib.estimate import physics
 from calib.estimate import quantities as kinds
+from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import Kind, Quantity
 from calib.model import Array, Pose, own_channels
-
-if TYPE_CHECKING:
-    from calib.estimate.nuisances import Priors
+from calib.signal.response import ALL_POWERS, by_term
+from calib.windows.deviations import ByAxis, LeftOpen
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
 AXES = "xyz"
@@ -306,3 +306,71 @@ def _only(poses: Sequence[Pose], where: int | list[int], value: Array) -> Array:
 
 def _axes(name: str) -> list[str]:
     return [f"{name}_{axis}" for axis in AXES]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """The inputs in P poses at given values of the nuisances: `direction` D (P, 3, M) of the motion; `gravity` G (P, 3)
+    and `offset` (P, 3) in m/s2; `lag_s` (3,); `reference_corner` and `sensor_corner` in rad/s."""
+
+    direction: Array
+    gravity: Array
+    offset: Array
+    lag_s: Array
+    reference_corner: float
+    sensor_corner: float
+
+
+class Nuisances:
+    """The J nuisances of P poses whose uncertainty is not 0: `effect` (P, SIZE, J) of one unit of each on the inputs of
+    a window (calib.estimate.physics), an offset in m/s2; `response` (J, K) on the terms of the response."""
+
+    def __init__(
+        self, poses: Sequence[Pose], channels: int, priors: Priors, applied: Applied, reference: str = ""
+    ) -> None:
+        """`reference` is the identity of the reference; see `terms`."""
+        self.terms = [t for t in terms(poses, channels, priors, applied.by_kind, reference) if t.uncertainty > 0.0]
+        self.direction = np.array([physics.padded(pose.direction, channels) for pose in poses])
+        self.gravity = np.nan_to_num([pose.gravity_mps2 for pose in poses])  # 0 in a pose whose gravity is not known
+        self.effect = np.zeros((len(poses), physics.SIZE, len(self.terms)))
+        for j, term in enumerate(self.terms):
+            self.effect[:, :, j] = term.on_inputs(len(poses))
+        self.response = self.effect[0, physics.RESPONSE, :].T[:, : priors.response_model.powers]
+        self._corners = [
+            np.array([0.0 if corner is None else corner[0] for corner in own])
+            for own in ([t.reference_corner for t in self.terms], [t.sensor_corner for t in self.terms])
+        ]
+        # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
+        self.reference_frequency_hz, self._known_size = priors.reference_frequency_hz, priors.known_size
+        at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
+        self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_model.powers)[0].real
+        self.applied_response = np.array([t.applied for t in self.terms]) @ self.response
+
+    def __len__(self) -> int:
+        return len(self.terms)
+
+    @property
+    def uncertainty(self) -> Array:
+        """(J,) prior standard uncertainties."""
+        return np.array([t.uncertainty for t in self.terms])
+
+    def steady(self, z: Array) -> Array:
+        """(...,) the sensitivity at 0 Hz over that at the reference frequency at the values `z` (..., J)."""
+        return np.asarray(
+            np.exp(-((self.applied_response + z @ self.response) @ self._at_reference + self._known_size))
+        )
+
+    def by_axis(self, z: Array, left_open: LeftOpen) -> ByAxis:
+        """The effect of axes that do not respond quite alike, at the values `z` (J,) of the nuisances."""
+        terms, powers = self.applied_response + z @ self.response, ALL_POWERS[: len(self._at_reference)]
+        return left_open.by_axis(terms, self._at_reference, powers)
+
+    def at(self, z: Array) -> Inputs:
+        """The inputs when the nuisances have the values `z` (J,), or (..., J): then all have these dimensions in
+        front."""
+        p = (self.effect @ z[..., None, :, None])[..., 0]
+        reference, sensor = (z @ corner for corner in self._corners)
+        return Inputs(
+            physics.felt_motion(p, self.direction), physics.felt_gravity(p, self.gravity), p[..., physics.Q],
+            p[..., 0, physics.LAG], reference, sensor,
+        )  # fmt: skip

@@ -10,7 +10,8 @@ from typing import Literal
 
 import numpy as np
 
-from calib.estimate.nuisances import Applied, Inputs, Nuisances, Priors
+from calib.estimate.nuisances import Applied, Priors
+from calib.estimate.terms import Inputs, Nuisances
 from calib.model import Array, Calibration, Pose
 from calib.paper.propagation import Contribution, Response, Statement, propagate
 from calib.paper.sine_fit import (

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.estimate.nuisances import Applied, Inputs, Nuisances, Priors
+from calib.estimate.nuisances import Applied, Priors
+from calib.estimate.terms import Inputs, Nuisances
 from calib.model import Array, Pose, Window
 from calib.paper.method3 import Fit
 from calib.paper.propagation import Contribution, Statement, propagate

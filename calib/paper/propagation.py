@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.distributions import coverage_factor
-from calib.estimate.nuisances import Inputs, Nuisances
+from calib.estimate.terms import Inputs, Nuisances
 from calib.model import Array
 
 Response = Callable[[Inputs], Array]

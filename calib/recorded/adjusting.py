@@ -20,9 +20,10 @@ from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array, Window
 from calib.recorded.certificate import ReferenceCertificate
+from calib.recorded.measurement_result import NuisanceValue
 from calib.recorded.narrower import Band, narrower_bands
 from calib.recorded.options import Options
-from calib.recorded.outcome import NuisanceValue, Outcome, nothing_used
+from calib.recorded.outcome import Outcome, nothing_used
 from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
 from calib.recorded.table import SensorTable
 from calib.recorded.tables import Tables

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import io
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.model import PARAMETERS, Array
-
-if TYPE_CHECKING:
-    from calib.recorded.outcome import Outcome
+from calib.recorded.measurement_result import MeasurementResult
 
 AXES = "xyz"
 COLOURS = ("#0068b5", "#c2500a", "#00805e")  # x, y, z; colour-blind people can distinguish them too
@@ -32,25 +30,25 @@ class Drawing(Figure):
         return buffer.getvalue()
 
 
-def figure_of(outcome: Outcome) -> Drawing:
+def figure_of(result: MeasurementResult) -> Drawing:
     """S and Q with U (or the reasons for a refusal), the response over frequency where it is known, and the windows."""
-    bands = outcome.response
+    bands = result.response
     figure = Drawing(figsize=(9.0, 5.4 if bands else 3.6), dpi=80, layout="constrained", facecolor="white")
     heights = [3.0, 3.0, 1.0] if bands else [3.0, 1.0]
     grid = figure.add_gridspec(len(heights), 2, height_ratios=heights, width_ratios=[3.0, 1.0])
-    if outcome.calibration is None:
-        _reasons(figure.add_subplot(grid[0, :]), outcome)
+    if result.calibration is None:
+        _reasons(figure.add_subplot(grid[0, :]), result)
     else:
-        _sensitivity(figure.add_subplot(grid[0, 0]), outcome)
-        _offset(figure.add_subplot(grid[0, 1]), outcome)
+        _sensitivity(figure.add_subplot(grid[0, 0]), result)
+        _offset(figure.add_subplot(grid[0, 1]), result)
     if bands:
-        _response(figure.add_subplot(grid[1, :]), outcome)
-    _windows(figure.add_subplot(grid[-1, :]), outcome)
+        _response(figure.add_subplot(grid[1, :]), result)
+    _windows(figure.add_subplot(grid[-1, :]), result)
     return figure
 
 
-def _reasons(axes: Axes, outcome: Outcome) -> None:
-    lines = [line for reason in outcome.reasons for line in textwrap.wrap(reason, WRAP, subsequent_indent="  ")]
+def _reasons(axes: Axes, result: MeasurementResult) -> None:
+    lines = [line for reason in result.reasons for line in textwrap.wrap(reason, WRAP, subsequent_indent="  ")]
     if len(lines) > MOST_REASONS:
         lines = [*lines[: MOST_REASONS - 1], "..."]
     axes.set_axis_off()
@@ -58,18 +56,18 @@ def _reasons(axes: Axes, outcome: Outcome) -> None:
     axes.text(0.0, 0.95, "\n".join(lines), va="top", transform=axes.transAxes, parse_math=False)
 
 
-def _sensitivity(axes: Axes, outcome: Outcome) -> None:
+def _sensitivity(axes: Axes, result: MeasurementResult) -> None:
     """Main sensitivities as deviations from their mean, transverse ones as they are, all in % of that mean."""
-    values = outcome.values[:9]
+    values = result.values[:9]
     mean = float(np.nanmean(np.abs(values[MAIN])))
     shown = 100.0 * (np.where(MAIN, np.abs(values) - mean, values)) / mean
-    _points(axes, shown, 100.0 * outcome.expanded_uncertainty[:9] / mean, PARAMETERS[:9])
+    _points(axes, shown, 100.0 * result.expanded_uncertainty[:9] / mean, PARAMETERS[:9])
     axes.set_title(f"S: main minus their mean {mean:.6g}, and transverse", loc="left", fontsize=10)
     axes.set_ylabel("% of the mean")
 
 
-def _offset(axes: Axes, outcome: Outcome) -> None:
-    _points(axes, outcome.offset, outcome.expanded_uncertainty[9:], PARAMETERS[9:])
+def _offset(axes: Axes, result: MeasurementResult) -> None:
+    _points(axes, result.offset, result.expanded_uncertainty[9:], PARAMETERS[9:])
     axes.set_title("Q", loc="left", fontsize=10)
     axes.set_ylabel("output unit")
 
@@ -88,14 +86,14 @@ def _points(axes: Axes, values: Array, expanded: Array, names: tuple[str, ...]) 
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _response(axes: Axes, outcome: Outcome) -> None:
+def _response(axes: Axes, result: MeasurementResult) -> None:
     """Magnitude of the main sensitivities in each band, relative to that in the band of the reference frequency."""
-    bands, at_hz = outcome.response, outcome.reference_frequency_hz or 0.0
+    bands, at_hz = result.response, result.reference_frequency_hz or 0.0
     here = min(bands, key=lambda band: abs(np.sqrt(band.low_hz * band.high_hz) - at_hz))
     for i, axis in enumerate(AXES):
         there = np.array([abs(band.sensitivity[i, i]) for band in bands])
         u = np.array([band.standard_uncertainty[i, i] for band in bands])
-        at, expanded = 100.0 * (there / abs(here.sensitivity[i, i]) - 1.0), 100.0 * outcome.coverage_factor * u / there
+        at, expanded = 100.0 * (there / abs(here.sensitivity[i, i]) - 1.0), 100.0 * result.coverage_factor * u / there
         beside = BESIDE ** (i - 1)
         middles = [beside * float(np.sqrt(band.low_hz * band.high_hz)) for band in bands]
         style: dict[str, Any] = {"color": COLOURS[i], "capsize": 3, "markersize": 3}
@@ -111,13 +109,13 @@ def _response(axes: Axes, outcome: Outcome) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _windows(axes: Axes, outcome: Outcome) -> None:
+def _windows(axes: Axes, result: MeasurementResult) -> None:
     """Windows over time: those that are used filled, the others empty."""
     for used, colour in ((True, COLOURS[0]), (False, "none")):
-        spans = [(w.start_s, w.stop_s - w.start_s) for w in outcome.windows if w.used is used]
+        spans = [(w.start_s, w.stop_s - w.start_s) for w in result.windows if w.used is used]
         axes.broken_barh(spans, (0.1, 0.8), facecolor=colour, edgecolor=COLOURS[0])
-    count = sum(w.used for w in outcome.windows)
-    title = f"windows: {count} used (filled), {len(outcome.windows) - count} not used (empty)"
+    count = sum(w.used for w in result.windows)
+    title = f"windows: {count} used (filled), {len(result.windows) - count} not used (empty)"
     axes.set_title(title, loc="left", fontsize=10)
     axes.set_yticks([])
     axes.set_ylim(0.0, 1.0)

@@ -7,18 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from calib.estimate.quantities import BETWEEN_WINDOWS, KINDS
 from calib.model import PARAMETERS, Array
 from calib.output_unit import shown_in
+from calib.recorded.measurement_result import MeasurementResult
 from calib.recorded.options import STATED
 from calib.rounding import KNOWN_BEFORE, aligned, plus_minus, rounded
-
-if TYPE_CHECKING:
-    from calib.recorded.outcome import Outcome
 
 AXES = "xyz"
 MAIN, OFFSET = (0, 4, 8), (9, 10, 11)
@@ -49,64 +47,64 @@ class Source:
     way: str
 
 
-def lines_of(outcome: Outcome) -> Iterator[str]:
+def lines_of(result: MeasurementResult) -> Iterator[str]:
     """S and Q with U, their units, where S holds, and the largest sources of U. Nothing where S and Q are refused."""
-    if outcome.calibration is None:
+    if result.calibration is None:
         return
-    yield from aligned([("", "Sx", "Sy", "Sz", "Q"), *rows_of(outcome)])
-    yield from notes_of(outcome)
-    if sources := largest_sources(outcome):
-        heads = [f"U({PARAMETERS[k]})" for k in parameters_of(outcome)]
+    yield from aligned([("", "Sx", "Sy", "Sz", "Q"), *rows_of(result)])
+    yield from notes_of(result)
+    if sources := largest_sources(result):
+        heads = [f"U({PARAMETERS[k]})" for k in parameters_of(result)]
         rows = [(s.name, *map(rounded, s.expanded), s.way) for s in sources]
         yield from aligned([("largest sources", *heads, "smaller with"), *rows], words=(0, len(heads) + 1))
 
 
-def rows_of(outcome: Outcome) -> list[tuple[str, ...]]:
+def rows_of(result: MeasurementResult) -> list[tuple[str, ...]]:
     """A row for each axis: its name, and its parameters as value ± U."""
-    cells = outcome.cells()
+    cells = result.cells()
     return [(axis, *cells[3 * i : 3 * i + 3], cells[9 + i]) for i, axis in enumerate(AXES)]
 
 
-def notes_of(outcome: Outcome) -> Iterator[str]:
+def notes_of(result: MeasurementResult) -> Iterator[str]:
     """Units and k, what was known before, where S holds and what did not move, as sentences without full stop."""
-    shown = shown_in(outcome.unit)
-    kind = f", {outcome.uncertainty_kind}" if outcome.uncertainty_kind else ""
-    yield f"{shown.words}, U with k = {outcome.coverage_factor:.3g}{kind}"
-    if np.any(np.isfinite(outcome.values) & ~outcome.determined):
+    shown = shown_in(result.unit)
+    kind = f", {result.uncertainty_kind}" if result.uncertainty_kind else ""
+    yield f"{shown.words}, U with k = {result.coverage_factor:.3g}{kind}"
+    if np.any(np.isfinite(result.values) & ~result.determined):
         yield f"{KNOWN_BEFORE} known before: the data do not halve its uncertainty"
-    if outcome.where_it_holds:
-        yield outcome.where_it_holds
-    if outcome.where_nothing_moved:
-        yield outcome.where_nothing_moved
-    if at_rest := _at_0hz(outcome, shown.factors):
+    if result.where_it_holds:
+        yield result.where_it_holds
+    if result.where_nothing_moved:
+        yield result.where_nothing_moved
+    if at_rest := _at_0hz(result, shown.factors):
         yield f"at 0 Hz: {at_rest}"
 
 
-def _at_0hz(outcome: Outcome, factors: Array) -> str:
+def _at_0hz(result: MeasurementResult, factors: Array) -> str:
     """The main sensitivities at rest; "" where they are not known, or where S itself holds there."""
-    told: Mapping[str, Any] | None = outcome.more.get("sensitivity_at_0hz")
-    if told is None or not outcome.reference_frequency_hz:
+    told: Mapping[str, Any] | None = result.more.get("sensitivity_at_0hz")
+    if told is None or not result.reference_frequency_hz:
         return ""
     names = ("sensitivity", "standard_uncertainty")
     S, u = (factors[:9] * np.asarray(told[name], dtype=float).ravel() for name in names)
     known = [k for k in MAIN if np.isfinite(S[k]) and np.isfinite(u[k])]
-    return ", ".join(f"{PARAMETERS[k]} {plus_minus(S[k], outcome.coverage_factor * u[k])}" for k in known)
+    return ", ".join(f"{PARAMETERS[k]} {plus_minus(S[k], result.coverage_factor * u[k])}" for k in known)
 
 
-def parameters_of(outcome: Outcome) -> list[int]:
+def parameters_of(result: MeasurementResult) -> list[int]:
     """The main sensitivity with the largest relative U, and the offset with the largest U, as far as they are known."""
-    u, values = outcome.standard_uncertainty, outcome.values
+    u, values = result.standard_uncertainty, result.values
     compared = {k: u[k] / abs(values[k]) for k in MAIN if values[k]} | {k: u[k] for k in OFFSET}
     told = [[k for k in group if np.isfinite(compared.get(k, np.nan))] for group in (MAIN, OFFSET)]
     return [max(group, key=lambda k: float(compared[k])) for group in told if group]
 
 
-def largest_sources(outcome: Outcome) -> list[Source]:
+def largest_sources(result: MeasurementResult) -> list[Source]:
     """The sources with the largest shares in the variances of `parameters_of`, the largest first; three at most."""
-    chosen = parameters_of(outcome)
-    variances = outcome.standard_uncertainty[chosen] ** 2
-    factors = outcome.coverage_factor * shown_in(outcome.unit).factors[chosen]
-    parts = {name: np.array([_of(part, k) for k in chosen]) for name, part in outcome.more.get("budget", {}).items()}
+    chosen = parameters_of(result)
+    variances = result.standard_uncertainty[chosen] ** 2
+    factors = result.coverage_factor * shown_in(result.unit).factors[chosen]
+    parts = {name: np.array([_of(part, k) for k in chosen]) for name, part in result.more.get("budget", {}).items()}
     shares = {name: float(np.max(u**2 / variances)) for name, u in parts.items() if u.size}
     largest = sorted(shares, key=lambda name: -shares[name])[:MOST_SOURCES]
     return [Source(name, tuple((factors * parts[name]).tolist()), way_of(name)) for name in largest]

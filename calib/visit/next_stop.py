@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.adjustment.adjustment import Adjustment
-from calib.estimate.nuisances import Applied, Nuisances, Priors
+from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.physics import STEP
 from calib.estimate.quantities import REFERENCE, REFERENCE_DRIFT, S_AND_Q, Quantity
+from calib.estimate.terms import Nuisances
 from calib.model import Array, Pose, Window
 from calib.windows.sums import pool
 

@@ -11,8 +11,9 @@ import pytest
 
 from calib.adjustment.mistakes import with_unit
 from calib.recorded.errors import InputError, OptionError
+from calib.recorded.measurement_result import NuisanceValue
 from calib.recorded.notebook import calibrate
-from calib.recorded.outcome import NuisanceValue, Outcome
+from calib.recorded.outcome import Outcome
 from calib.recorded.table import ReferenceTable
 from calib.recorded.wrong_unit import check_gravity, gravity_warnings
 from tests.clamp_windows import frame
