@@ -7,7 +7,7 @@ and whether the result may be used (verdict).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -175,14 +175,9 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     held = [e.pose for e in found]
-    solution = solve(Equations(data, held, priors, applied, scatter, ways), priors)
-    common_lag_s = _lag_s(solution)
-    for _ in range(SCATTER_TURNS if priors.lag_s > 0.0 else 0):
-        larger = estimated(scatter, *slope_residuals(solution), data.type_a.slopes)
-        if larger.lag_s.max() <= (1.0 + SCATTER_SETTLED) * scatter.lag_s.max():
-            break
-        scatter = larger
-        solution = solve(Equations(data, held, priors, applied, scatter, ways), priors)
+    equations = partial(Equations, data, held, priors, applied, ways=ways)
+    first = solve(equations(scatter), priors)
+    solution, scatter = _with_scatter(first, scatter, equations, priors)
     shares = budget(solution, priors.offset_mps2, priors.known_u)
     mean, covariance = solution.x[:12], shares.covariance[:12, :12]
     prior_u = _prior_u(stated, solution.equations.output_per_mps2)
@@ -212,7 +207,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         lag_scatter_s=float(scatter.lag_s.max()),
         misfit=misfit(solution),
         nuisance_pull=nuisance_pull(solution, shares.covariance)[0],
-        common_lag_s=common_lag_s,
+        common_lag_s=_lag_s(first),
         mean=solution.x,
         covariance=shares.covariance,
         response=_response(solution, shares.covariance, priors, used, k),
@@ -253,6 +248,19 @@ def _prior_u(priors: Priors, scale: float) -> Array:
     u = np.where(np.isfinite(priors.parameters), np.sqrt(np.diag(priors.covariance)), np.inf)
     u[:9] = np.where(u[:9] < scale, u[:9], np.inf)
     return np.asarray(u)
+
+
+def _with_scatter(
+    solution: Solution, scatter: SlopeScatter, equations: Callable[[SlopeScatter], Equations], priors: Priors
+) -> tuple[Solution, SlopeScatter]:
+    """The solution with the scatter of the slopes that its residuals show, and this scatter."""
+    for _ in range(SCATTER_TURNS if priors.lag_s > 0.0 else 0):
+        larger = estimated(scatter, *slope_residuals(solution), solution.equations.data.type_a.slopes)
+        if larger.lag_s.max() <= (1.0 + SCATTER_SETTLED) * scatter.lag_s.max():
+            break
+        scatter = larger
+        solution = solve(equations(scatter), priors)
+    return solution, scatter
 
 
 def _without_offset(priors: Priors) -> Priors:

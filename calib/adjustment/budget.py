@@ -58,10 +58,7 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float
         sources |= {name: (middle, np.inf) for name, middle in _of_bands(solution, banded).items()}
     half = solution.half
     sources["prior of S and Q"] = (half[:12].T @ solution.prior_precision[:12, :12] @ half[:12], np.inf)
-    terms = solution.equations.nuisances.terms
-    for source in dict.fromkeys(t.source for t in terms):
-        own = np.array([half[12 + j] / t.uncertainty for j, t in enumerate(terms) if t.source == source])
-        sources[source] = (own.T @ own, np.inf)
+    sources |= {source: (middle, np.inf) for source, middle in _of_nuisances(solution).items()}
     total = np.sum([middle for middle, _ in sources.values()], axis=0)
     variances = {name: _variances(half[:12], middle) for name, (middle, _) in sources.items()}
     spent = np.sum([variances[name] ** 2 / freedom for name, (_, freedom) in sources.items()], axis=0)
@@ -92,6 +89,15 @@ def _type_a(solution: Solution) -> Array:
     mean_rows = mean_rows * np.sqrt(equations.white_share)[..., None]
     band_rows = equations.band_rows(solution.jacobian)
     return _quadratic(slope_rows, type_a.slopes) + _quadratic(mean_rows, type_a.means) + band_rows.T @ band_rows
+
+
+def _of_nuisances(solution: Solution) -> dict[str, Array]:
+    """The sources that the priors of the nuisances state."""
+    terms, half, found = solution.equations.nuisances.terms, solution.half, {}
+    for source in dict.fromkeys(t.source for t in terms):
+        own = np.array([half[12 + j] / t.uncertainty for j, t in enumerate(terms) if t.source == source])
+        found[source] = own.T @ own
+    return found
 
 
 def _of_bands(solution: Solution, banded: Banded) -> dict[str, Array]:

@@ -141,17 +141,21 @@ class Unknowns:
                 new.append(unknown)
         return new
 
+    def _of_s_and_q(self) -> list[Unknown]:
+        s, unknowns = self.statements, []
+        # A tilt moves the mean output of a mount that never turns.
+        tilted_mps2 = 0.0 if s.held_mps2 is None else float(np.linalg.norm(s.held_mps2))
+        walks = s.wander.variance_a_day(s.scale, tilted_mps2).tolist()
+        for quantity, mean, stated, walk in zip(S_AND_Q, s.mean.tolist(), s.u_parameters.tolist(), walks, strict=True):
+            u = max(stated, EXACT * s.scale)
+            bound = u**2 if u < 0.5 * FLAT * s.scale else np.inf
+            unknowns.append(Unknown(quantity, mean, u, self.begin, walk, bound))
+        return unknowns
+
     def _of_sensor(self) -> Iterable[Unknown]:
         s, begin = self.statements, self.begin
         stepping = {key for step in s.steps for key in step.u}
-        # A tilt moves the mean output of a mount that never turns.
-        tilted_mps2 = 0.0 if s.held_mps2 is None else float(np.linalg.norm(s.held_mps2))
-        unknowns, walks = [], s.wander.variance_a_day(s.scale, tilted_mps2)
-        for k, (quantity, stated) in enumerate(zip(S_AND_Q, s.u_parameters.tolist(), strict=True)):
-            u = max(stated, EXACT * s.scale)
-            bound = u**2 if u < 0.5 * FLAT * s.scale else np.inf
-            own = Unknown(quantity, float(s.mean[k]), u, begin, float(walks[k]), bound)
-            unknowns.append(own)
+        unknowns = self._of_s_and_q()
         yield from unknowns
         rate_u, rate_walk = (s.wander.of(w) * s.scale for w in (OFFSET_RATE.prior, OFFSET_RATE.walk))
         for name in ALL_RATES:

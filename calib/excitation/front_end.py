@@ -293,6 +293,14 @@ def _rest(
     return [rest_window(pose, t, V, settings.limits, floor=floor, leave_out=settings.leave_out)]
 
 
+def _against(found: Aligned, made: Sequence[Window]) -> NoiseFilter | None:
+    """A filter against noise of the sensor, where its windows are knocked or hardly coherent, and where one helps."""
+    knocked = any(100.0 * w.left_out > KNOCKED_PCT * (w.points + w.left_out) for w in made)
+    if not knocked and not any(w.numbers.get("coherence", 1.0) < COHERENT for w in made):
+        return None
+    return against_noise(found.points, found.reference_noise, knocked=knocked)
+
+
 def _motion(
     pose: Pose,
     sensor: Samples,
@@ -313,21 +321,21 @@ def _motion(
         within = _motion(stands, sensor, reference, instrument, span_s, lag_s, limited, response)
         if any(window.used for window in within):
             return within
-    knocked = any(100.0 * w.left_out > KNOCKED_PCT * (w.points + w.left_out) for w in made)
-    against = None
-    if settings.limit_band and (knocked or any(w.numbers.get("coherence", 1.0) < COHERENT for w in made)):
-        against = against_noise(found.points, found.reference_noise, knocked=knocked)
-        better = None if against is None else align(against=against)
-        if better is None:
-            against = None
-        else:
-            found, made = better, _beside(pose, better, settings, before=found.points)
+    against = _against(found, made) if settings.limit_band else None
+    if against is not None and (better := align(against=against)) is not None:
+        found, made = better, _beside(pose, better, settings, before=found.points)
+    else:
+        against = None
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     taken = () if response.is_flat else response.terms
     made = [replace(_slow(_told(w, found), found.points), u_lag_s=u_lag_s, response=taken) for w in made]
     # Where the noise of the reference is stated, all other noise is the sensor's.
     sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
-    return [w if w.bands is None else replace(w, bands=_noisy(w.bands, sensor_noise, against)) for w in made]
+    return [_with_noise(w, sensor_noise, against) for w in made]
+
+
+def _with_noise(window: Window, sensor_noise: Array, against: NoiseFilter | None) -> Window:
+    return window if window.bands is None else replace(window, bands=_noisy(window.bands, sensor_noise, against))
 
 
 def _beside_shocks(points: Points, made: Sequence[Window]) -> float | None:

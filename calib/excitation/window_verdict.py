@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from operator import gt, le, lt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,28 @@ NONLINEAR_SD = 4.0  # a difference by so many standard uncertainties, of few blo
 # The means of a window's segments by so many of their standard uncertainties may be noise, in some hundred of them.
 DRIFT_SD = 5.0
 STEP_SD = 5.0  # a step of the mean by so many of its standard uncertainties may be noise, wherever it is searched
+
+
+# Why a window is refused: a statistic, how it breaks its limit, and the sentence; the first that breaks it is told.
+RULES: tuple[tuple[str, Callable[[float, float], bool], str], ...] = (
+    ("points", lt, "too few points: {points:.0f}, {points_threshold:.0f} needed"),
+    ("reference_rms_mps2", le, "the reference is silent: {reference_rms_mps2:.3g} m/s2 rms in band, "
+     "{reference_rms_mps2_threshold:.3g} m/s2 needed (its noise is {reference_noise_mps2:.3g} m/s2)"),
+    ("stuck_axes", gt, "dead: the output of {stuck_axes:.0f} of the sensor's axes does not change at all"),
+    ("clipped_points", gt, "clipped: {clipped_points:.0f} points at the end of the sensor's range"),
+    ("coherence", lt, "the sensor does not follow the reference: coherence {coherence:.3f}, "
+     "{coherence_threshold:g} needed"),
+    ("drift_mps2", gt, "the sensor's mean changes by {drift_mps2:.3g} m/s2 within the window, "
+     "{drift_mps2_threshold:.3g} m/s2 at most"),
+    ("step_mps2", gt, "the sensor's mean changes by {step_mps2:.3g} m/s2 from one part of the window to the other, "
+     "{step_mps2_threshold:.3g} m/s2 at most by the stated uncertainties of angle and offset"),
+    ("nonlinearity_pct", gt, "the output is not proportional to the motion: where the motion is strongest, the "
+     "sensitivity differs by {nonlinearity_pct:.1f} %, {nonlinearity_pct_threshold:.1f} % at most (a mount that slips "
+     "or rattles?)"),
+    ("sd_over_floor", gt, "the sensor is not at rest: its noise is {sd_over_floor:.1f} times that in other positions, "
+     "{sd_over_floor_threshold:g} times at most"),
+    ("left_out_pct", gt, "{left_out_pct:.1f} % of the points are knocks, {left_out_pct_threshold:g} % at most"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,44 +139,7 @@ def _thresholds(n: Mapping[str, float], limits: Limits) -> dict[str, float]:
 
 def _reason(n: Mapping[str, float]) -> str:
     """The first limit that these numbers do not meet, as a sentence; "" if they meet all limits."""
-    limit = {name: n[f"{name}_threshold"] for name in n if f"{name}_threshold" in n}
-    if n["points"] < limit["points"]:
-        return f"too few points: {n['points']:.0f}, {limit['points']:.0f} needed"
-    if "reference_rms_mps2" in n:
-        if n["reference_rms_mps2"] <= limit["reference_rms_mps2"]:
-            return (
-                f"the reference is silent: {n['reference_rms_mps2']:.3g} m/s2 rms in band, "
-                f"{limit['reference_rms_mps2']:.3g} m/s2 needed (its noise is {n['reference_noise_mps2']:.3g} m/s2)"
-            )
-        if n["stuck_axes"] > limit["stuck_axes"]:
-            return f"dead: the output of {n['stuck_axes']:.0f} of the sensor's axes does not change at all"
-        if n["clipped_points"] > limit["clipped_points"]:
-            return f"clipped: {n['clipped_points']:.0f} points at the end of the sensor's range"
-        if n["coherence"] < limit["coherence"]:
-            return (
-                f"the sensor does not follow the reference: coherence {n['coherence']:.3f}, "
-                f"{limit['coherence']:g} needed"
-            )
-        if n["drift_mps2"] > limit["drift_mps2"]:
-            return (
-                f"the sensor's mean changes by {n['drift_mps2']:.3g} m/s2 within the window, "
-                f"{limit['drift_mps2']:.3g} m/s2 at most"
-            )
-    if "step_mps2" in n and n["step_mps2"] > limit["step_mps2"]:
-        return (
-            f"the sensor's mean changes by {n['step_mps2']:.3g} m/s2 from one part of the window to the other, "
-            f"{limit['step_mps2']:.3g} m/s2 at most by the stated uncertainties of angle and offset"
-        )
-    if disproportionate(n):
-        return (
-            f"the output is not proportional to the motion: where the motion is strongest, the sensitivity differs by "
-            f"{n['nonlinearity_pct']:.1f} %, {limit['nonlinearity_pct']:.1f} % at most (a mount that slips or rattles?)"
-        )
-    if "sd_over_floor" in n and n["sd_over_floor"] > limit["sd_over_floor"]:
-        return (
-            f"the sensor is not at rest: its noise is {n['sd_over_floor']:.1f} times that in other positions, "
-            f"{limit['sd_over_floor']:g} times at most"
-        )
-    if n["left_out_pct"] > limit["left_out_pct"]:
-        return f"{n['left_out_pct']:.1f} % of the points are knocks, {limit['left_out_pct']:g} % at most"
+    for name, broken, sentence in RULES:
+        if f"{name}_threshold" in n and broken(n[name], n[f"{name}_threshold"]):
+            return sentence.format_map(n)
     return ""

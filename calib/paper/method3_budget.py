@@ -51,16 +51,16 @@ class _Model:
         self.windows = windows
         m = windows[0].sums.reference_channels
         whole = [pool(w.sums) for w in windows]
+        scatter = np.array([s.scatter[0] for s in whole])
         self._root_count = np.sqrt([float(s.count[0]) for s in whole])
         self._mean_u = np.array([s.mean[0, :m] for s in whole])
-        values, vectors = np.linalg.eigh(np.array([s.scatter[0, :m, :m] for s in whole]))
+        values, vectors = np.linalg.eigh(scatter[:, :m, :m])
         self._root_u = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)  # (W, m, m)
-        power = [(np.trace(s.scatter[0, m : 2 * m, m : 2 * m]), np.trace(s.scatter[0, :m, :m])) for s in whole]
+        power = [(np.trace(each[m : 2 * m, m : 2 * m]), np.trace(each[:m, :m])) for each in scatter]
         self._omega = np.sqrt([fast / slow if slow > 0 else 1.0 for fast, slow in power])
-        self._known = np.array([np.isfinite(w.pose.gravity_mps2).all() for w in windows])
-        self._inverse = np.linalg.pinv(
-            self._rows(np.array([w.pose.direction for w in windows]), np.array([w.pose.gravity_mps2 for w in windows]))
-        )
+        gravity = np.array([w.pose.gravity_mps2 for w in windows])
+        self._known = np.isfinite(gravity).all(axis=1)
+        self._inverse = np.linalg.pinv(self._rows(np.array([w.pose.direction for w in windows]), gravity))
 
     def solution(self, inputs: Inputs, offset: Array) -> Array:
         """(12,) result of plain Method 3 for the true `inputs` and an `offset` (W, 3) of each window in m/s2."""

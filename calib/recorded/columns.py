@@ -8,19 +8,14 @@ from calib.recorded.units import Sensitivity, unit_of
 
 TEMPERATURE = "temperature_degc"
 ELECTRICAL = ("indication", "count")
+QUANTITIES = {"a": "acceleration", "v": "velocity", "d": "displacement"}  # by the letter with which they are stated
 
 
 def sensor_columns(choice: Choice) -> list[Chosen]:
     """Columns of time, x, y, z and, where there is one, temperature. Raises InputError."""
     if not choice.is_stated and (found := choice.standard(SENSOR)):
         return [*found, *(choice.standard([TEMPERATURE]) or [])]
-    roles = {role: choice.stated(role) or choice.guessed(role) for role in ("time", *AXES)}
-    known = {role: column for role, column in roles.items() if column}
-    rest = choice.rest(list(known.values()))
-    if "time" in known and len(known) == 1 and len(rest) == len(AXES):
-        known |= dict(zip(AXES, rest, strict=True))
-    if not known and len(rest) == 4 and all(c.column.name.isdigit() for c in rest):
-        known = dict(zip(("time", *AXES), rest, strict=True))
+    known = _with_unnamed(choice, _by_role(choice))
     missing = [role for role in ("time", *AXES) if role not in known]
     if missing:
         names = dict(zip(("time", *AXES), SENSOR, strict=True))
@@ -33,37 +28,57 @@ def sensor_columns(choice: Choice) -> list[Chosen]:
     return list(known.values())
 
 
+def _by_role(choice: Choice) -> dict[str, Chosen]:
+    """The columns that are stated, or that their names tell."""
+    roles = {role: choice.stated(role) or choice.guessed(role) for role in ("time", *AXES)}
+    return {role: column for role, column in roles.items() if column}
+
+
+def _with_unnamed(choice: Choice, known: dict[str, Chosen]) -> dict[str, Chosen]:
+    """The same with the columns beside the time, or with all, where only their order tells what they are."""
+    rest = choice.rest(list(known.values()))
+    if list(known) == ["time"] and len(rest) == len(AXES):
+        return known | dict(zip(AXES, rest, strict=True))
+    if not known and len(rest) == 4 and all(c.column.name.isdigit() for c in rest):
+        return dict(zip(("time", *AXES), rest, strict=True))
+    return known
+
+
 def reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:
     """Columns of time and of one or three channels, and their quantity. Raises InputError."""
-    if not choice.is_stated:
-        found = {names: choice.standard(("time_s", *names)) for names in REFERENCES}
-        there = [(names, columns) for names, columns in found.items() if columns]
-        if len(there) > 1:
-            raise choice.fault(f"expected exactly one of {' | '.join(','.join(names) for names, _ in there)}")
-        if there:
-            names, columns = there[0]
-            return columns or [], sensitivity.quantity if sensitivity else REFERENCES[names]
+    if not choice.is_stated and (standard := _standard_reference(choice)):
+        columns, quantity = standard
+        return columns, sensitivity.quantity if sensitivity else quantity
     time = choice.stated("time") or choice.guessed("time")
-    letters = {letter: choice.stated(letter) for letter in "avd"}
-    one = [(letter, column) for letter, column in letters.items() if column]
-    three = [choice.stated(axis) for axis in AXES]
-    if not one and not any(three):
-        three = [choice.guessed(axis) for axis in AXES]
-    given = [column for column in three if column]
-    if not one and not given and time:
-        given = choice.rest([time])
-    if not time or len(one) + len(given) not in (1, 3) or (one and given):
+    stated_as, channels = _channels(choice, time)
+    if not time or len(channels) not in (1, 3):
         raise choice.fault("expected exactly one of time and one channel, or time and x, y and z,")
-    channels = [column for _, column in one] or given
-    quantity = {"a": "acceleration", "v": "velocity", "d": "displacement"}[one[0][0]] if one else None
-    quantity = (sensitivity.quantity if sensitivity else None) or quantity or quantity_of(channels[0])
-    if quantity is None and len(channels) == 3:
-        quantity = "acceleration"
-    if quantity is None and not _is_electrical(channels[0]):
+    told = (sensitivity.quantity if sensitivity else None) or stated_as or quantity_of(channels[0])
+    if told is None and len(channels) < 3 and not _is_electrical(channels[0]):
         raise choice.fault(f"neither name nor unit tells what {str(channels[0].column)!r} is, add its unit")
     if not choice.is_stated:
-        choice.say({"time": time} | {f"{k}": c for k, c in zip(AXES, channels, strict=False)})
-    return [time, *channels], quantity or "acceleration"
+        choice.say({"time": time} | dict(zip(AXES, channels, strict=False)))
+    return [time, *channels], told or "acceleration"
+
+
+def _standard_reference(choice: Choice) -> tuple[list[Chosen], str] | None:
+    """The columns of a reference with this program's names, and their quantity; None where there are none."""
+    found = {names: choice.standard(("time_s", *names)) for names in REFERENCES}
+    there = [(names, columns) for names, columns in found.items() if columns]
+    if len(there) > 1:
+        raise choice.fault(f"expected exactly one of {' | '.join(','.join(names) for names, _ in there)}")
+    return (there[0][1], REFERENCES[there[0][0]]) if there else None
+
+
+def _channels(choice: Choice, time: Chosen | None) -> tuple[str | None, list[Chosen]]:
+    """The quantity that is stated with one channel, and the channels: one, three, or any other number if they are not
+    to be told."""
+    one = [(quantity, column) for letter, quantity in QUANTITIES.items() if (column := choice.stated(letter))]
+    three = [column for axis in AXES if (column := choice.stated(axis))]
+    if one:
+        return one[0][0], [column for _, column in one] if not three else []
+    three = three or [column for axis in AXES if (column := choice.guessed(axis))]
+    return None, three or (choice.rest([time]) if time else [])
 
 
 def _is_electrical(chosen: Chosen) -> bool:

@@ -94,15 +94,7 @@ class Options:
         for name in ("sensor_filter", "reference_filter"):
             object.__setattr__(self, name, _lines(getattr(self, name)))
             for line in getattr(self, name):
-                try:
-                    highpass = isinstance(filter_of(line), Highpass)
-                except ValueError as error:
-                    raise OptionError(str(error), column=name, value=line) from None
-                if highpass:
-                    corner = name.replace("filter", "corner_hz")
-                    raise _wrong(
-                        name, line, f"state the corner of an AC-coupled instrument in `{corner}`, `u_{corner}`"
-                    )
+                _check_filter(name, line)
         if self.rotation is not None and np.shape(self.rotation) != (3, 3):
             raise _wrong("rotation", self.rotation, "give a matrix of 3 x 3 numbers, a = R a_ref")
         if self.band_hz is not None and not _rises(self.band_hz):
@@ -117,23 +109,41 @@ class Options:
 
         Raises OptionError.
         """
-        if (self.nominal is None) != (self.u_nominal_pct is None):
-            raise OptionError("`nominal` and `u_nominal_pct` must be given together")
-        if self.nominal is not None and prior:
-            raise OptionError("give `nominal` or `prior`, not both")
-        if self.rotation is not None and not reference:
-            raise OptionError("`rotation` needs a tri-axial `reference`")
-        if self.method != 3 and not (reference and poses):
-            raise OptionError(f"`method` {self.method} needs `reference` and `poses`")
-        if (self.sensor_filter or self.reference_filter) and (self.method != 3 or self.plain or not reference):
-            raise OptionError("`sensor_filter` and `reference_filter` are for Method 3 with a `reference`, not `plain`")
-        if self.band_hz is not None and (self.method != 3 or self.plain or not reference):
-            raise OptionError("`band_hz` is for Method 3 with a `reference`, not `plain`")
+        adjusts = self.method == 3 and not self.plain and reference
+        rules = (
+            ((self.nominal is None) != (self.u_nominal_pct is None),
+             "`nominal` and `u_nominal_pct` must be given together"),
+            (self.nominal is not None and prior, "give `nominal` or `prior`, not both"),
+            (self.rotation is not None and not reference, "`rotation` needs a tri-axial `reference`"),
+            (self.method != 3 and not (reference and poses), f"`method` {self.method} needs `reference` and `poses`"),
+            (bool(self.sensor_filter or self.reference_filter) and not adjusts,
+             "`sensor_filter` and `reference_filter` are for Method 3 with a `reference`, not `plain`"),
+            (self.band_hz is not None and not adjusts, "`band_hz` is for Method 3 with a `reference`, not `plain`"),
+            (bool(outside := self._outside_band), outside),
+            (self.method != 3 and self.plain, "`plain` is for Method 3 only; remove `plain` or `method`"),
+        )  # fmt: skip
+        for broken, message in rules:
+            if broken:
+                raise OptionError(message)
+
+    @property
+    def _outside_band(self) -> str:
+        """Why the frequency at which S is to hold does not fit the band; "" where it does."""
         at_hz = self.reference_frequency_hz
-        if self.band_hz is not None and at_hz is not None and not self.band_hz[0] <= at_hz <= self.band_hz[1]:
-            raise OptionError(f"`reference_frequency_hz` is {at_hz:g} Hz, outside `band_hz`; state one within it")
-        if self.method != 3 and self.plain:
-            raise OptionError("`plain` is for Method 3 only; remove `plain` or `method`")
+        if self.band_hz is None or at_hz is None or self.band_hz[0] <= at_hz <= self.band_hz[1]:
+            return ""
+        return f"`reference_frequency_hz` is {at_hz:g} Hz, outside `band_hz`; state one within it"
+
+
+def _check_filter(name: str, line: str) -> None:
+    """Raise OptionError for a line that states no filter, or a high-pass, which is stated by its corner."""
+    try:
+        highpass = isinstance(filter_of(line), Highpass)
+    except ValueError as error:
+        raise OptionError(str(error), column=name, value=line) from None
+    if highpass:
+        corner = name.replace("filter", "corner_hz")
+        raise _wrong(name, line, f"state the corner of an AC-coupled instrument in `{corner}`, `u_{corner}`")
 
 
 def _lines(given: str | Sequence[str]) -> tuple[str, ...]:

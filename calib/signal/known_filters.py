@@ -8,7 +8,7 @@ sensitivity of the certificate holds). How well it is known is part of it. Sourc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from typing import get_type_hints
 
@@ -287,17 +287,25 @@ def filter_of(text: str) -> Filter:
     for word in words:
         name, equals, value = word.partition("=")
         if not equals or name not in known:
-            raise ValueError(f"{word!r}: {kind} takes {', '.join(f'{name}=...' for name in known)}")
+            raise ValueError(f"{word!r}: {kind} takes {_names(known)}")
         if name in values:
             raise ValueError(f"{name} is given twice; give it once")
-        numbers = _numbers(name, value)
-        if hints[name] is float and len(numbers) != 1:
-            raise ValueError(f"{name}: {len(numbers)} numbers; give one")
-        values[name] = numbers[0] if hints[name] is float else numbers
+        values[name] = _one_number(name, value) if hints[name] is float else _numbers(name, value)
     missing = [name for name, f in known.items() if f.default is MISSING and name not in values]
     if missing:
-        raise ValueError(f"{kind} needs {', '.join(f'{name}=...' for name in missing)}")
+        raise ValueError(f"{kind} needs {_names(missing)}")
     return made(**values)
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(f"{name}=..." for name in names)
+
+
+def _one_number(name: str, value: str) -> float:
+    numbers = _numbers(name, value)
+    if len(numbers) != 1:
+        raise ValueError(f"{name}: {len(numbers)} numbers; give one")
+    return numbers[0]
 
 
 def corner_apart(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[float, float]]:

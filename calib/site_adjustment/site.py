@@ -9,7 +9,7 @@ eliminated one by one (Schur complement, by QR factors). The rest, the core, is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,24 +62,22 @@ class Site:
     def __init__(self, devices: Sequence[Device], links: Sequence[Link]) -> None:
         self.devices = {d.name: d for d in devices}
         self._links = links
-        for each in links:
-            for name in (each.sensor, *_core_of(each)):
-                if name not in self.devices:
-                    raise ValueError(f"{name} is in a link, but there is no such device")
-            if each.sensor == each.reference:
-                raise ValueError(f"{each.sensor} cannot be its own reference")
         of: dict[str, list[int]] = {}
         for k, each in enumerate(links):
+            _check_link(each, self.devices)
             of.setdefault(each.sensor, []).append(k)
         core = {name for each in links for name in _core_of(each)}
         self.core = [d.name for d in devices if d.name in core]
         self._leaf_links = {name: own for name, own in of.items() if name not in core}
         self._core_links = [k for k, each in enumerate(links) if each.sensor in core]
         self._turns = np.zeros((len(links), 3))  # rotation vectors, rad
-        ends = np.cumsum([0, *(self.devices[name].root.shape[1] for name in self.core)])
-        self._at = {name: np.arange(a, b, dtype=np.intp) for name, a, b in zip(self.core, ends, ends[1:], strict=False)}
-        self._size = int(ends[-1])
-        self._owner = [name for name in self.core for _ in self._at[name]]
+        self._at: dict[str, NDArray[np.intp]] = {}
+        self._owner: list[str] = []  # the device of each unknown
+        for name in self.core:
+            first, n = len(self._owner), self.devices[name].root.shape[1]
+            self._at[name] = np.arange(first, first + n, dtype=np.intp)
+            self._owner += n * [name]
+        self._size = len(self._owner)
         self.x = {d.name: d.mean.copy() for d in devices}
         self.steps = 0
         self._solve()
@@ -265,6 +263,15 @@ class Site:
             Message(index, tail[:c, :c], tail[:c, c], float(tail[c, c] ** 2), by_reference),
             half @ factor[:local, -1], -half @ factor[:local, local:-1], half, own, observed,
         )  # fmt: skip
+
+
+def _check_link(link: Link, devices: Mapping[str, Device]) -> None:
+    """Raise ValueError for a link with a device that is not there, or of a device with itself."""
+    for name in (link.sensor, *_core_of(link)):
+        if name not in devices:
+            raise ValueError(f"{name} is in a link, but there is no such device")
+    if link.sensor == link.reference:
+        raise ValueError(f"{link.sensor} cannot be its own reference")
 
 
 def _core_of(one: Link) -> list[str]:

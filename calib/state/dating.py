@@ -132,6 +132,14 @@ def _probability(cost: Callable[[float], float], edges: Array) -> Array:
     return np.asarray(np.diff(edges) * np.exp(-0.5 * (costs - costs.min())))
 
 
+def _by_epoch(whole: Estimate) -> list[list[tuple[Record, Array]]]:
+    """The records of each epoch, with their rows."""
+    own: list[list[tuple[Record, Array]]] = [[] for _ in whole.days]
+    for k, record, rows in zip(whole.epoch_of.tolist(), whole.records, whole.rows, strict=True):
+        own[k].append((record, rows))
+    return own
+
+
 class _Supposed:
     """The solution without a change, and what it costs to suppose the change at a time.
 
@@ -146,10 +154,7 @@ class _Supposed:
         self._moves = moves
         self._unknowns = unknowns.with_statements(replace(unknowns.statements, steps=others))
         self._days, self._x, size = whole.days, whole.x, len(unknowns)
-        own: list[list[tuple[Record, Array]]] = [[] for _ in whole.days]
-        for k, record, rows in zip(whole.epoch_of.tolist(), whole.records, whole.rows, strict=True):
-            own[k].append((record, rows))
-        self._own = own
+        self._own = own = _by_epoch(whole)
         ends = [[record.days for record, _ in seen] or [(day, day)] for seen, day in zip(own, self._days, strict=True)]
         self._first = np.array([min(first for first, _ in days) for days in ends])
         self._last = np.array([max(last for _, last in days) for days in ends])

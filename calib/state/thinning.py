@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -60,43 +61,50 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
     if len(records) == 1:
         return records[0]
     first, m2 = records[0], 2 * records[0].channels
-    windows = np.array([float(r.windows) for r in records])
+
+    def each(name: str) -> list[Any]:
+        return [getattr(r, name) for r in records]
+
+    windows = np.array(each("windows"), dtype=float)
     share = windows / windows.sum()
 
     def mean(name: str) -> Array:
-        return np.asarray(sum(w * getattr(r, name) for w, r in zip(share, records, strict=True)))
+        return np.asarray(sum(w * value for w, value in zip(share, each(name), strict=True)))
 
-    noise = np.sqrt(sum(w * r.noise**2 for w, r in zip(share, records, strict=True)))
+    noise = np.sqrt(sum(w * value**2 for w, value in zip(share, each("noise"), strict=True)))
     root, slopes, passed = _stacked(records, noise, m2)
     mean_x = mean("mean_x")
     D = first.pose.direction
     # The means of V at one mean of the reference: its own motion moves them by S as nearly as nominal.
     moved = [r.means - np.outer(r.over_t[:, 0], nominal @ D @ (r.mean_x - mean_x)[: D.shape[1]]) for r in records]
-    days = min(r.days[0] for r in records), max(r.days[1] for r in records)
+    begun, ended = zip(*each("days"), strict=True)
+    days = min(begun), max(ended)
     # Over weeks Q drifts with the seasons, and the temperature within them would take it up: the mean alone is kept.
     rows = 3 if days[1] - days[0] <= BRIEF_DAYS else 1
-    over = _triangle(np.hstack([np.vstack([r.over_t for r in records]), np.vstack(moved)]), rows)
+    over = _triangle(np.hstack([np.vstack(each("over_t")), np.vstack(moved)]), rows)
     power = np.array([(r.root[:, : r.channels] ** 2).sum() for r in records]) + np.finfo(float).tiny
-    deviations, left_open = Deviations(), LeftOpen()
-    motions = [r.motion for r in records if r.motion is not None]
-    for r in records:
-        deviations, left_open = deviations.plus(r.deviations), left_open.plus(r.left_open)
+
+    def by_windows(name: str) -> float:
+        return float(share @ each(name))
+
+    def by_power(name: str) -> float:
+        return float(power @ each(name) / power.sum())
+
+    motions = [motion for motion in each("motion") if motion is not None]
     return replace(
         first,
-        day=float(share @ [r.day for r in records]),
-        days=days, windows=int(windows.sum()),
-        u_lag_s=_rms(share, [r.u_lag_s for r in records]), attenuation=_rms(share, [r.attenuation for r in records]),
-        independent=float(share @ [r.independent for r in records]), along=mean("along"),
+        day=by_windows("day"), days=days, windows=int(windows.sum()),
+        u_lag_s=_rms(share, each("u_lag_s")), attenuation=_rms(share, each("attenuation")),
+        independent=by_windows("independent"), along=mean("along"),
         along_rate_s=mean("along_rate_s"), root=root, slopes=slopes, passed=passed,
-        omega2=float(power @ [r.omega2 for r in records] / power.sum()), noise=noise,
-        scores=np.asarray(sum(r.scores for r in records)),
+        omega2=by_power("omega2"), noise=noise, scores=np.asarray(sum(each("scores"))),
         mean_x=mean_x, means=over[:, 3:], over_t=over[:, :3],
-        temperature_degc=float(power @ [r.temperature_degc for r in records] / power.sum()),
-        behind_k=float(power @ [r.behind_k for r in records] / power.sum()), held_mps2=mean("held_mps2"),
-        count=float(sum(r.count for r in records)), told=_triangle(np.vstack([r.told for r in records]), TOLD),
-        deviations=deviations, left_open=left_open, mean_hz=float(share @ [r.mean_hz for r in records]),
+        temperature_degc=by_power("temperature_degc"), behind_k=by_power("behind_k"), held_mps2=mean("held_mps2"),
+        count=float(sum(each("count"))), told=_triangle(np.vstack(each("told")), TOLD),
+        deviations=reduce(Deviations.plus, each("deviations"), Deviations()),
+        left_open=reduce(LeftOpen.plus, each("left_open"), LeftOpen()), mean_hz=by_windows("mean_hz"),
         motion=reduce(Motion.plus, motions) if motions else None,
-        to_hz=max(r.to_hz for r in records), bands=None, reference_noise=None,
+        to_hz=max(each("to_hz")), bands=None, reference_noise=None,
     )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ it (calib.estimate.statements.Widening). What was told stays so until `restart`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -25,7 +25,7 @@ import numpy as np
 from calib.drift.drift import DAY_S, DriftVerdict
 from calib.drift.false_alarms import false_alarm_threshold
 from calib.estimate.estimate import Now
-from calib.estimate.quantities import RATES, YEAR_DAYS
+from calib.estimate.quantities import RATES, YEAR_DAYS, Quantity
 from calib.estimate.statements import Widening
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array, own_channels
@@ -67,14 +67,11 @@ class Shown:
 def shown(now: Now, record: Record, *, fixed: bool) -> Shown:
     """S and Q as the reference of a record, its newest one, shows them. `fixed`: the mount never turns."""
     unknowns, scale = now.unknowns.all, now.unknowns.statements.scale
-    S, jacobian = now.mean[:9].reshape(3, 3), np.eye(12, len(now))
+    jacobian = np.eye(12, len(now))
     makers = [{own.key: (1.0, own.a_day)} for own in unknowns[:12]]
-    drifts = [q for q in now.quantities if q.kind.since_certificate and q.owner == record.reference and not q.centre]
-    ways = record.pose.direction[:, : own_channels(record.channels)].T
-    for quantity, way in zip(drifts, ways, strict=False):
+    for quantity, moves in _drifts(now, record, fixed=fixed):
         k = now.index(quantity.key)
-        along = np.outer(way, way) if fixed or len(ways) > 1 else np.eye(3)  # a mount that turns brings it to all axes
-        jacobian[:9, k] = -(S @ along).ravel()
+        jacobian[:9, k] = moves
         for own, moved in zip(makers[:9], np.abs(jacobian[:9, k]).tolist(), strict=True):
             if moved > SHARED * scale:
                 own[quantity.key] = (1.0 / moved, unknowns[k].a_day)
@@ -88,6 +85,15 @@ def shown(now: Now, record: Record, *, fixed: bool) -> Shown:
         np.append(none, np.sum(half[9:] * now.factor[rates], axis=1)),
         jacobian**2 @ a_day, np.append(none, u[rates] ** 2), np.append(none, a_day[rates]), makers, fixed,
     )  # fmt: skip
+
+
+def _drifts(now: Now, record: Record, *, fixed: bool) -> Iterator[tuple[Quantity, Array]]:
+    """The drift of each channel of a record's reference, and (9,) by what one unit of it moves S as it is shown."""
+    S, ways = now.mean[:9].reshape(3, 3), record.pose.direction[:, : own_channels(record.channels)].T
+    drifts = [q for q in now.quantities if q.kind.since_certificate and q.owner == record.reference and not q.centre]
+    for quantity, way in zip(drifts, ways, strict=False):
+        along = np.outer(way, way) if fixed or len(ways) > 1 else np.eye(3)  # a mount that turns brings it to all axes
+        yield quantity, -(S @ along).ravel()
 
 
 def _lean(now: Now, record: Record, makers: Sequence[dict[str, tuple[float, float]]]) -> None:

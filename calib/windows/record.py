@@ -16,7 +16,7 @@ import numpy as np
 from calib.model import Array, BandSums, Pose, Window, WindowSums
 from calib.signal.response import ALL_POWERS
 from calib.windows.bands import ABOVE, HIGHEST, motion_band_hz, parts, share_above
-from calib.windows.condense import condense, mean_frequency_hz, regressed
+from calib.windows.condense import Condensed, condense, mean_frequency_hz, regressed
 from calib.windows.deviations import Deviations, LeftOpen
 from calib.windows.excited import Motion, excited, excited_together, excited_ways, motion_of
 from calib.windows.never_turned import mean_input
@@ -119,23 +119,12 @@ class Record:
             to_hz = WIDER * lasts_hz[1]
         data = condense([found], response_hz=to_hz, one_frequency=motion_hz is None)
         channels = data.channels
-        passed, told = np.zeros((TERMS, 2 * channels, channels)), np.zeros((0, TERMS + 1))
-        deviations, left_open = Deviations(), LeftOpen()
-        if (bands := data.bands) is not None:
-            k = bands.projected.shape[1]
-            passed[:k] = data.root[0] @ bands.projected[0]
-            told = np.zeros((min(k + 1, len(bands.residual)), TERMS + 1))
-            rows = np.column_stack([bands.moves, bands.residual])
-            triangle = np.asarray(np.linalg.qr(rows, mode="r"))[: len(told)]
-            told[:, :k], told[:, -1] = triangle[:, :-1], triangle[:, -1]
-            deviations, left_open = bands.deviations, bands.left_open
+        passed, told, deviations, left_open = _over_frequency(data)
         t = temperature_degc if np.isfinite(temperature_degc) else 0.0
         directions = found.directions
         mean_hz = mean_frequency_hz(data)
         ends_hz = WIDER * (mean_hz if motion_hz is None else motion_hz[1])
-        noise, kept = window.reference_noise, _up_to(window.bands, ends_hz)
-        if window.bands is not None and kept is not None and noise is not None:
-            noise = noise * np.sqrt(window.bands.points.sum() / kept.points.sum())
+        noise, kept = _kept_bands(window, ends_hz)
         made = cls(
             window.pose, reference, day, (day, day), 1, lag_s, window.response, window.u_lag_s, found.attenuation,
             window.independent, np.round(directions @ directions.T, 6) + 0.0,
@@ -272,6 +261,30 @@ def together(records: Sequence[Record], *, fixed: bool) -> list[Record]:
         return list(records)
     excited_by_all = np.round(ways @ ways.T, 6) + 0.0
     return [r if r.motion is None else replace(r, excited=excited_by_all) for r in records]
+
+
+def _over_frequency(data: Condensed) -> tuple[Array, Array, Deviations, LeftOpen]:
+    """(TERMS, 2M, M) what each term of the response adds, what the bands tell of the terms as a triangle, and what the
+    terms do not explain."""
+    channels, bands = data.channels, data.bands
+    passed = np.zeros((TERMS, 2 * channels, channels))
+    if bands is None:
+        return passed, np.zeros((0, TERMS + 1)), Deviations(), LeftOpen()
+    k = bands.projected.shape[1]
+    passed[:k] = data.root[0] @ bands.projected[0]
+    told = np.zeros((min(k + 1, len(bands.residual)), TERMS + 1))
+    rows = np.column_stack([bands.moves, bands.residual])
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))[: len(told)]
+    told[:, :k], told[:, -1] = triangle[:, :-1], triangle[:, -1]
+    return passed, told, bands.deviations, bands.left_open
+
+
+def _kept_bands(window: Window, ends_hz: float) -> tuple[Array | None, BandSums | None]:
+    """The noise of the reference in the bands up to `ends_hz`, and these bands."""
+    noise, kept = window.reference_noise, _up_to(window.bands, ends_hz)
+    if window.bands is not None and kept is not None and noise is not None:
+        noise = noise * np.sqrt(window.bands.points.sum() / kept.points.sum())
+    return noise, kept
 
 
 def _up_to(bands: BandSums | None, to_hz: float) -> BandSums | None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from calib.model import Array, WindowSums
 
@@ -53,17 +53,22 @@ def window_sums(u: ArrayLike, du: ArrayLike, V: ArrayLike, segment_edges: ArrayL
     n, m = channels.shape
     if rates.shape != (n, m) or indications.shape != (n, 3):
         raise ValueError(f"shapes do not fit: u {channels.shape}, du {rates.shape}, V {indications.shape}")
-    edges = np.asarray(segment_edges, dtype=np.int64)
-    if edges.size < 2 or np.any(np.diff(edges) < 0) or edges[0] < 0 or edges[-1] > n:
-        raise ValueError(f"segment edges must rise within 0..{n} (two or more sample numbers), are {edges.tolist()}")
-    bounds = [(int(a), int(b)) for a, b in itertools.pairwise(edges) if b > a]
-    if not bounds:
-        raise ValueError("a window needs at least one sample")
+    bounds = _bounds(np.asarray(segment_edges, dtype=np.int64), n)
     parts = [_segments(channels[a:b], rates[a:b], indications[a:b], count) for a, b, count in _alike(bounds)]
     mean, scatter = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not (np.isfinite(mean).all() and np.isfinite(scatter).all()):
         raise ValueError("a window's samples must be finite: leave out samples that are missing (NaN)")
     return WindowSums(m, np.array([float(b - a) for a, b in bounds]), mean, scatter)
+
+
+def _bounds(edges: NDArray[np.int64], n: int) -> list[tuple[int, int]]:
+    """First sample of each segment and that after its last, without the segments that are empty. Raises ValueError."""
+    if edges.size < 2 or np.any(np.diff(edges) < 0) or edges[0] < 0 or edges[-1] > n:
+        raise ValueError(f"segment edges must rise within 0..{n} (two or more sample numbers), are {edges.tolist()}")
+    bounds = [(int(a), int(b)) for a, b in itertools.pairwise(edges) if b > a]
+    if not bounds:
+        raise ValueError("a window needs at least one sample")
+    return bounds
 
 
 def merge(parts: Sequence[WindowSums]) -> WindowSums:
