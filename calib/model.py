@@ -127,6 +127,11 @@ class Window:
     response: tuple[float, ...] = ()  # terms (calib.signal.response) that were taken out; () where none were
     motion_hz: tuple[float, float] | None = None
 
+    @property
+    def silent_noise(self) -> Array:
+        """(3,) noise of channels that were left out of the sums (calib.excitation.excited): none were."""
+        return np.zeros(3)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:

@@ -37,10 +37,7 @@ from calib.windows.excited import excited_together
 
 METHOD = "3 (adjustment)"
 LAG_SD, LAG_PERIODS = 3.0, 3.0  # how far a lag is searched: stated standard uncertainties, periods of the motion
-# Windows of one frequency that differ by more, as SD over S, are tried with other lags (over a period), but none near a
-# half, where S has the other sign. From MOST_PHASE_RAD on they are refused: S is smaller by half of its square.
-ALIKE, OTHER_LAGS = 0.03, (1 / 12, -1 / 12, 1 / 6, -1 / 6, 1 / 4, -1 / 4)
-MOST_PHASE_RAD = 0.1
+MOST_PHASE_RAD = 0.1  # SD between windows of one frequency: S is smaller by half of its square
 LEAST_USED = 0.05  # of the points in motion
 MAIN = [0, 4, 8]  # of PARAMETERS
 HALF_OCTAVE = 2.0**0.5
@@ -132,33 +129,9 @@ def _repeated(outcome: Outcome, tables: Tables, priors: Priors, band_hz: Band) -
     return other.fits and not bool(np.any(away > largest))
 
 
-def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN_BANDS) -> _Told:
-    """Make windows with the lag and the response over frequency taken out, and adjust them. Bands may deviate from one
-    response by `most_between`.
-
-    Where all motion has one frequency, each window of it fits several lags, each with another S. Where windows then
-    differ from each other, the search may have led to a lag that not all of them fit, and begins anew at others. What
-    is refused stays so: half a period later, a tone of the other sign fits as well.
-    """
-    told = _searched(tables, priors, most_between, priors.lag_at_s)
-    found = told.found
-    if told.outcome.reasons or found is None or found.response is None:
-        return told
-    if found.grounds.priors.response_model.one_frequency and _between_windows(told) > ALIKE:
-        period_s, lag_s = 1.0 / found.response.reference_frequency_hz, found.lag_s or 0.0
-        others = [_searched(tables, priors, most_between, lag_s + share * period_s) for share in OTHER_LAGS]
-        told = min((told, *others), key=lambda each: (bool(each.outcome.reasons), _between_windows(each)))
-    return told
-
-
 def _phase_scatter(found: Adjustment) -> float:
     """SD in rad of the phase by which windows differ, at the frequency at which S holds."""
     return 0.0 if found.response is None else 2.0 * np.pi * found.response.reference_frequency_hz * found.lag_scatter_s
-
-
-def _between_windows(told: _Told) -> float:
-    """By how much the slopes of windows differ from each other in size and phase, relative to S, as SD."""
-    return np.inf if told.found is None else float(np.hypot(_phase_scatter(told.found), told.found.slope_scatter))
 
 
 def _not_alike(found: Adjustment) -> str:
@@ -175,10 +148,11 @@ def _not_alike(found: Adjustment) -> str:
     )
 
 
-def _searched(tables: Tables, priors: Priors, most_between: float, begin_s: float) -> _Told:
-    """What the search tells that begins at this lag in s."""
+def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN_BANDS) -> _Told:
+    """Make windows with the lag and the response over frequency taken out, and adjust them. Bands may deviate from one
+    response by `most_between`."""
     search = _Search(tables, priors, most_between)
-    applied = search.begin(begin_s)
+    applied = search.begin()
     refused = None if _used(search.windows) else search.windows
     first: tuple[Adjustment, float] | None = None
     for turn in range(RESPONSE_TURNS):
@@ -231,12 +205,12 @@ class _Search:
         self.windows: list[Window] = []
         self._latest: tuple[Sequence[Window], Applied, Adjustment] | None = None
 
-    def begin(self, lag_s: float) -> Applied:
-        """Make the first windows, at this lag; returns what the search goes on with.
+    def begin(self) -> Applied:
+        """Make the first windows; returns what the search goes on with.
 
         If none can be used the sensor may be far too late, or a response may look like a mean that changes.
         """
-        flat = Applied(lag_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
+        flat = Applied(self._priors.lag_at_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
         applied = self.make(flat)
         if not _used(self.windows):
             applied = self.make(replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, self.windows)))

@@ -3,6 +3,9 @@
 Stamps from a recorder's own clock are evenly spaced, but the rate of that clock may be wrong by 10 to 50 ppm: the lag
 then changes by about a millisecond per minute. Since V(t) = S a(t - lag), each segment of motion shows the lag in the
 coefficient on the reference's derivative.
+
+Of a tone on an ellipse, du/dt is a sum of the channels of u: the sensitivities of such a window can make any lag, and
+it tells none.
 """
 
 from __future__ import annotations
@@ -13,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.model import Array, Window, WindowSums
-from calib.windows.sums import NOISE_FLOOR, factor
+from calib.windows.excited import NOISE_LEFT
+from calib.windows.sums import NOISE_FLOOR, factor, pool
 
 LEAST_SEGMENTS = 6  # two unknowns, and four degrees of freedom for the scatter
 SIGNIFICANT = 5.0  # standard uncertainties; to correct a smaller drift would improve nothing
@@ -42,18 +46,41 @@ def drift(windows: Sequence[Window]) -> Drift | None:
     None if there are fewer than LEAST_SEGMENTS.
     """
     moving = [w for w in windows if w.used and w.kind == "motion"]
-    found = [part for part in map(segment_lags, moving) if len(part)]
-    lags = np.concatenate(found) if found else np.empty((0, 3))
-    if len(lags) < LEAST_SEGMENTS:
+    told = [(w, u_s) for w in moving if np.isfinite(u_s := u_lag_s(w))]
+    found = [(lags, u_s) for w, u_s in told if len(lags := segment_lags(w))]
+    if sum(len(lags) for lags, _ in found) < LEAST_SEGMENTS:
         return None
-    time_s, lag_s, u_s = lags.T
+    time_s, lag_s, u_s = np.concatenate([lags for lags, _ in found]).T
     weight = 1.0 / u_s**2
     middle = float(weight @ time_s / weight.sum())
-    design = np.column_stack([np.ones(len(lags)), time_s - middle])
-    inverse = np.linalg.inv(design.T @ (weight[:, None] * design))
-    line = inverse @ (design.T @ (weight * lag_s))
-    scatter = float(weight @ (lag_s - design @ line) ** 2) / (len(lags) - 2)
+    design = np.column_stack([np.ones(len(lag_s)), time_s - middle, lag_s])
+    products, at = np.zeros((3, 3)), 0
+    for lags, common_s in found:
+        rows, own = design[at : at + len(lags)], weight[at : at + len(lags)]
+        mean = own @ rows / (own.sum() + 1.0 / common_s**2)  # the error that all segments share is a part of the mean
+        products += rows.T @ (own[:, None] * rows) - np.outer(own @ rows, mean)
+        at += len(lags)
+    inverse = np.linalg.pinv(products[:2, :2], hermitian=True)
+    line = inverse @ products[:2, 2]
+    scatter = float(products[2, 2] - line @ products[:2, 2]) / (len(lag_s) - 2)
     return Drift(middle, float(line[0]), float(line[1]), float(np.sqrt(inverse[1, 1] * max(scatter, 1.0))))
+
+
+def u_lag_s(window: Window) -> float:
+    """The standard uncertainty in s of the lag that all segments of a window share: what u tells of du/dt, the window's
+    sensitivities may tell of V in the place of a lag. inf where noise alone is left of du/dt.
+    """
+    whole, m = pool(window.sums), window.sums.reference_channels
+    power = whole.scatter[0]
+    direct, noise = _of_window(window.sums)
+    shared = np.linalg.pinv(power[:m, :m], rcond=UNSEEN, hermitian=True) @ power[:m, m : 2 * m]
+    left = power[m : 2 * m, m : 2 * m] - power[m : 2 * m, :m] @ shared
+    if window.reference_noise is not None and len(window.reference_noise[0]) == m:
+        own, of_rate = whole.count[0] * window.reference_noise**2
+        left_by_noise = np.diag(of_rate) + shared.T @ (own[:, None] * shared)
+        left = left - (1.0 + NOISE_LEFT) * left_by_noise
+    told = np.maximum(np.einsum("ji,jk,ki->i", direct, left, direct), 0.0)
+    return float(np.sqrt(told @ noise) / told.sum()) if told.any() else np.inf
 
 
 def segment_lags(window: Window) -> Array:

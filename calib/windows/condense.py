@@ -16,7 +16,7 @@ import numpy as np
 from calib.model import Array, BandSums, WindowSums, own_channels
 from calib.signal.response import POWERS
 from calib.windows.banded import Banded, banded
-from calib.windows.excited import NOISE_LEFT, OF_STRONGEST, OVER_NOISE
+from calib.windows.excited import NOISE_LEFT, OF_STRONGEST
 from calib.windows.type_a import LEAST_INFLATION, Index, Segments, TypeA, in_order, pooled
 
 PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the channels before it, is a rounding error
@@ -26,6 +26,7 @@ PIVOT_FLOOR = 1e-9  # of a channel's power: a smaller remainder, after the chann
 EXCITED = 0.5 * OF_STRONGEST
 # Of the power of a channel's derivative, what other channels leave of it: with less it is mostly another channel.
 SHARED = 0.5
+ROUNDING = 1e-12  # of a channel's mean: in a window in which it is constant, digits alone move it by less
 
 
 class Summed(Protocol):
@@ -39,6 +40,9 @@ class Summed(Protocol):
 
     @property
     def reference_noise(self) -> Array | None: ...
+
+    @property
+    def silent_noise(self) -> Array: ...
 
     @property
     def independent(self) -> float: ...
@@ -180,35 +184,41 @@ def _alike(at: Index, windows: Sequence[Summed], sums: Sequence[WindowSums], cha
         count[..., None] * mean,
         centre,
         noise,
+        np.array([windows[w].silent_noise for w in at.tolist()]),
         np.array([windows[w].independent for w in at.tolist()]),
     )
 
 
-def _left(part: Segments) -> Array:
-    """(W, 2M) the power of the reference's noise that may be left in the sums of a motion in a plane after it was
-    subtracted. Of a tone on an ellipse the derivative of one channel is another channel: beside it, noise alone is
-    left. Zeros for a motion in all directions, and for channels that show hardly more than noise by themselves."""
-    own, noise = np.diagonal(part.xx.sum(1), axis1=1, axis2=2), part.count.sum(1)[:, None] * part.noise
-    told = (own == 0.0).any(axis=1)[:, None] & (own > OVER_NOISE * noise)
-    return np.where(told, NOISE_LEFT * noise, 0.0)
+def _left(part: Segments) -> tuple[Array, Array]:
+    """The power (W, 2M) of each channel of which no sum tells a motion: rounding errors of the mean, which all segments
+    of a silent channel have; and the power (W, 2M) of the reference's noise of which the subtraction may leave a share.
+
+    Of a tone on an ellipse the derivative of one channel is another channel: beside it, noise alone is left. So the
+    noise is that of motion in a plane; zeros for a motion in all directions.
+    """
+    own, count = np.diagonal(part.xx.sum(1), axis1=1, axis2=2), part.count.sum(1)[:, None]
+    rounded = count * (ROUNDING * part.mean[:, : own.shape[1]]) ** 2
+    plane = (own <= rounded).any(axis=1)[:, None]
+    return rounded, np.where(plane, count * part.noise, 0.0)
 
 
-def _roots(power: Array, left: Array) -> tuple[Array, Array]:
+def _roots(power: Array, left: tuple[Array, Array]) -> tuple[Array, Array]:
     """R (W, 2M, 2M), upper triangular with R'R = power, and T with T power = R.
 
-    A channel without power of its own has rows of zeros: so much as noise may have `left` (W, 2M) is none.
+    A channel without power of its own has rows of zeros: so much as rounding and noise may have `left` is none. What
+    other channels leave of a channel has their noise too, by the squares of what they tell of it.
     """
-    size = power.shape[-1]
+    size, (rounded, noise) = power.shape[-1], left
     own, half = np.diagonal(power, axis1=1, axis2=2), size // 2
     strongest = np.repeat(own.reshape(len(own), 2, half).max(axis=2, initial=0.0), half, axis=1)
-    limit = np.maximum(np.maximum(PIVOT_FLOOR * own, EXCITED * strongest), left)
-    moved = own > limit  # noise in a silent channel must not correlate its column of S with the others
+    limit = np.maximum(np.maximum(PIVOT_FLOOR * own, EXCITED * strongest), rounded)
+    moved = own > np.maximum(limit, NOISE_LEFT * noise)  # a silent channel must not correlate its column with others
     power = np.where(moved[:, :, None] & moved[:, None], power, 0.0)
     work = np.concatenate([power, np.broadcast_to(np.eye(size), power.shape)], axis=2)
     rows = np.zeros_like(work)
     for j in range(size):
-        pivot = work[:, j, j]
-        live = pivot > np.maximum(limit[:, j], 0.0)
+        pivot, by_noise = work[:, j, j], np.sum(work[:, j, size:] ** 2 * noise, axis=1)
+        live = pivot > np.maximum(limit[:, j], NOISE_LEFT * by_noise)
         root = np.sqrt(np.where(live, pivot, 1.0))[:, None]
         rows[:, j] = np.where(live[:, None], work[:, j] / root, 0.0)
         work = work - rows[:, j, :size, None] * rows[:, j, None]

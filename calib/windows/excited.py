@@ -67,6 +67,13 @@ class Excitation:
         return self.window.independent
 
     @property
+    def silent_noise(self) -> Array:
+        """(3,) power in m2/s4 along the sensor's axes of the noise of silent channels: what they share with the motion
+        is known to it. Zeros at rest."""
+        silent = ~self.live if self.live.any() else np.zeros_like(self.live)
+        return np.asarray(self.window.pose.direction[:, : len(silent)][:, silent] ** 2 @ self.noise[0][silent])
+
+    @property
     def sums(self) -> WindowSums:
         """The sums after the correction."""
         sums, live = self.window.sums, self.live
@@ -159,16 +166,17 @@ def _within(found: Excitation, ways: Array) -> Excitation:
     pose, m, live = found.pose, len(found.live), np.flatnonzero(found.live)
     direction, pairs = pose.direction[:, :m], np.eye(pose.direction.shape[1] // m)
     inside = np.linalg.solve(direction, ways)
+    beside = np.linalg.svd(ways)[0][:, ways.shape[1] :]
+    told = np.linalg.solve(direction, beside) @ _surely_shared(found, beside.T @ direction)
     if len(live) == ways.shape[1]:
         along, ahead = np.zeros((m, m)), np.zeros((m, m))
         along[:, live] = inside @ np.linalg.pinv(inside[live])
+        told = told - along[:, live] @ told[live]  # the live channels are what they indicate
     else:
         assert pose.along is not None
         assert pose.along_rate_s is not None
         within = inside @ ways.T @ direction
         along, ahead = within @ pose.along[:m, :m], within @ pose.along_rate_s[:m, :m]
-    beside = np.linalg.svd(ways)[0][:, ways.shape[1] :]
-    told = np.linalg.solve(direction, beside) @ _surely_shared(found, beside.T @ direction)
     along[:, live] += told[:, : len(live)]
     ahead[:, live] += told[:, len(live) :]
     shared = [np.asarray(np.kron(pairs, part), dtype=float) for part in (along, ahead)]
@@ -182,7 +190,7 @@ def _surely_shared(found: Excitation, across: Array) -> Array:
     moving, power = np.flatnonzero(np.tile(found.live, 2)), _power(window)
     clean = _clean(power, found.noise)
     both = across @ clean[:m, moving]
-    told = _told_by(both, clean, power, moving)
+    told = _told_by(both, clean, found.noise, power, moving)
     noise = (across**2 @ found.noise[0]) * len(moving) / (window.independent * window.sums.count.sum())
     return np.where((np.sum(told * both, axis=1) > OVER_NOISE * noise)[:, None], told, 0.0)
 
@@ -277,7 +285,7 @@ def _shared(window: Window, live: NDArray[np.bool_], noise: Array) -> tuple[Arra
     if live.any() and not live.all():
         moving = np.flatnonzero(np.tile(live, 2))
         both = power[np.ix_(np.flatnonzero(~live), moving)]
-        found[np.ix_(~live, np.tile(live, 2))] = _told_by(both, _clean(power, noise), power, moving)
+        found[np.ix_(~live, np.tile(live, 2))] = _told_by(both, _clean(power, noise), noise, power, moving)
     return found[:, :m], found[:, m:]
 
 
@@ -286,8 +294,15 @@ def _clean(power: Array, noise: Array) -> Array:
     return np.asarray(power - np.diag(np.minimum(noise.ravel(), MOST_NOISE * power.diagonal())))
 
 
-def _told_by(both: Array, clean: Array, power: Array, moving: NDArray[np.intp]) -> Array:
-    """(j, k) regression on the channels `moving` (k,) of [u, du/dt], with which signals have the covariance `both`."""
+def _told_by(both: Array, clean: Array, noise: Array, power: Array, moving: NDArray[np.intp]) -> Array:
+    """(j, k) regression on the channels `moving` (k,) of [u, du/dt], with which signals have the covariance `both`.
+
+    Of a tone on an ellipse, du/dt is a sum of the channels of u: in such a combination the subtraction leaves noise
+    alone, of which nothing can be told.
+    """
     unit = np.sqrt(power.diagonal()[moving])
-    solved = np.linalg.pinv(clean[np.ix_(moving, moving)] / np.outer(unit, unit), OF_STRONGEST, hermitian=True)
-    return np.asarray(both / unit @ solved / unit)
+    values, ways = np.linalg.eigh(clean[np.ix_(moving, moving)] / np.outer(unit, unit))
+    by_noise = (noise.ravel()[moving] / unit**2) @ ways**2
+    told = values > np.maximum(OF_STRONGEST * values[-1], NOISE_LEFT * by_noise)
+    ways = ways[:, told]
+    return np.asarray(both / unit @ (ways / values[told]) @ ways.T / unit)

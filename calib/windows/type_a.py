@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calib.model import Array
 from calib.windows.sums import NOISE_FLOOR
 
+Scores = tuple[NDArray[np.bool_], Array]  # flags (D,) of the dimensions that windows have, and their scores (W, K, D)
 Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 Index = NDArray[np.intp]
 
@@ -34,8 +35,9 @@ class Segments:
 
     `at` (W,): which windows they are. Counts (W, K), x x' (W, K, 2M, 2M), x V' (W, K, 2M, 3), V V' (W, K, 3, 3), sums
     of [x, V] (W, K, 2M + 3); `mean` (W, 2M + 3) is that centre. `noise` (W, 2M): power a sample of the reference's own
-    noise, which is no longer in xx but still in the residuals. `independent` (W,): share of points that a filter left
-    independent.
+    noise, which is no longer in xx but still in the residuals. `silent` (W, 3): that of channels that are not in xx,
+    along the axes of V, to which the motion is known that they share. `independent` (W,): share of points that a filter
+    left independent.
     """
 
     at: Index
@@ -46,6 +48,7 @@ class Segments:
     total: Array
     mean: Array
     noise: Array
+    silent: Array
     independent: Array
 
 
@@ -93,17 +96,15 @@ def pooled(
     sd = np.sqrt(count @ noise**2 / count.sum())
     if alike:
         noise = np.tile(sd, (len(noise), 1))
-    size = roots[0].shape[-1]
-    slope_scores, mean_scores = [], []
-    for part, beta, t in zip(parts, slopes, whiteners, strict=True):
+    slope_scores, mean_scores = list[Scores](), list[Scores]()
+    for part, beta, t, root in zip(parts, slopes, whiteners, roots, strict=True):
         unit = (sd / np.sqrt(part.independent)[:, None])[:, None]
         score = np.einsum("wrc,wkci->wkri", t, part.xv - part.xx @ beta[:, None]) / unit[:, :, None]
-        slope_scores.append(score.reshape(*part.count.shape, 3 * size))
+        slope_scores += _with_data(score, np.diagonal(root, axis1=1, axis2=2) > 0.0)
         score = (part.total[..., -3:] - part.total[..., :-3] @ beta) / unit
-        mean_scores.append(score / np.sqrt(part.count.sum(1))[:, None, None])
-    live = np.repeat(np.any([np.any(np.diagonal(r, axis1=1, axis2=2) > 0.0, axis=0) for r in roots], axis=0), 3)
-    slope_cov, of_slopes, sums = _scatter(slope_scores, live)
-    mean_cov, of_means, mean_sums = _scatter(mean_scores, np.ones(3, dtype=bool))
+        mean_scores.append((np.ones(3, dtype=bool), score / np.sqrt(part.count.sum(1))[:, None, None]))
+    slope_cov, of_slopes, sums = _scatter(slope_scores, 3 * roots[0].shape[-1])
+    mean_cov, of_means, mean_sums = _scatter(mean_scores, 3)
     found = [own for own in (of_slopes, of_means) if own is not None]
     freedom = min((own.degrees_of_freedom for own in found), default=np.inf)
     known = min((own.known for own in found), default=0.0)
@@ -113,29 +114,45 @@ def pooled(
 def _noise(part: Segments, slopes: Array, root: Array) -> Array:
     """(W, 3) SD of the residuals of the windows with these slopes."""
     count, xv, vv = part.count.sum(1), part.xv.sum(1), np.diagonal(part.vv.sum(1), axis1=1, axis2=2)
-    xx = part.xx.sum(1) + count[:, None, None] * part.noise[:, None] * np.eye(part.noise.shape[1])
+    moved = part.xx.sum(1)
+    xx = moved + count[:, None, None] * part.noise[:, None] * np.eye(part.noise.shape[1])
     left = vv - 2.0 * np.einsum("wci,wci->wi", slopes, xv) + np.einsum("wci,wcd,wdi->wi", slopes, xx, slopes)
-    signal = vv + count[:, None] * part.mean[:, -3:] ** 2
+    signal, m = vv + count[:, None] * part.mean[:, -3:] ** 2, part.noise.shape[1] // 2
     freedom = count - 1.0 - np.count_nonzero(np.diagonal(root, axis1=1, axis2=2), axis=1)
     floor = NOISE_FLOOR * np.sqrt(signal.max(axis=1) / count)
     spread = np.sqrt(np.maximum(left, 0.0) / np.maximum(freedom, 1.0)[:, None])
+    felt, power = (np.einsum("wkk->w", own) for own in (np.swapaxes(slopes, 1, 2) @ moved @ slopes, moved[:, :m, :m]))
+    sensitivity2 = np.divide(felt, power, out=np.zeros_like(power), where=power > 0.0)
+    spread = np.hypot(spread, np.sqrt(sensitivity2[:, None] * part.silent))
     return np.asarray(np.maximum(spread, np.where(floor > 0.0, floor, 1.0)[:, None]))
 
 
-def _scatter(scores: list[Array], live: Flags) -> tuple[Array, Scattered | None, Array]:
-    """Covariance (D, D) of a window's summed scores, what it rests on, and `score_sums`; `live` (D,) are those with
-    data.
+def _with_data(score: Array, live: NDArray[np.bool_]) -> list[Scores]:
+    """Scores (W, K, 2M, 3) of the slopes with data, of which `live` (W, 2M) tells. A window at rest has none, and tells
+    nothing of their scatter."""
+    found = list[Scores]()
+    for which in np.unique(live, axis=0):
+        if which.any():
+            own = score[(live == which).all(axis=1)][:, :, which]
+            found.append((np.repeat(which, 3), own.reshape(*own.shape[:2], -1)))
+    return found
 
-    `scores` (W, K, D) of windows with K segments each.
-    """
-    sums = score_sums([s[..., live] for s in scores])
+
+def _scatter(scores: Sequence[Scores], size: int) -> tuple[Array, Scattered | None, Array]:
+    """Covariance (D, D) of a window's summed scores, D = `size`, what it rests on, and `score_sums`."""
+    sums = score_sums([s for _, s in scores])
     found = scattered(sums)
     if found is None:
-        return np.eye(len(live)), None, sums
-    for _ in range(found.level):
-        scores = [_paired(s) for s in scores]
-    covariance = np.sum([s.shape[1] * _flat(s).T @ _flat(s) for s in scores], axis=0) / sums[found.level, 0]
-    return covariance * found.inflation, found, sums
+        return np.eye(size), None, sums
+    covariance, freedom = np.zeros((size, size)), np.zeros(size)
+    for live, s in scores:
+        for _ in range(found.level):
+            s = _paired(s)
+        covariance[np.ix_(live, live)] += s.shape[1] * _flat(s).T @ _flat(s)
+        freedom[live] += len(s) * (s.shape[1] - 1.0)
+    told = freedom >= 1.0
+    weight = np.divide(1.0, np.sqrt(freedom), out=np.zeros(size), where=told)
+    return covariance * np.outer(weight, weight) * found.inflation + np.diag(~told * found.variance), found, sums
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,8 +61,8 @@ STATED = {"sensor_filter": "lowpass order=2 corner_hz=9", "reference_filter": "f
 def test_s_at_0_hz_is_told_by_rests_alone(
     response: Filter, stated: dict[str, str], shaken_mps2: float, one_in: int
 ) -> None:
-    """A corner near the only tone: how far S changes from 7.8 Hz to 0 Hz was a prior of 1 % to 2 %, and S at 0 Hz was
-    3.7 % off in one of these, and up to 16 % (9 U). Rests are right, whatever a filter does to the tone."""
+    """A corner near the only tone: how far S changes from 7.8 Hz to 0 Hz is a prior, and S at 0 Hz was up to 16 % (9 U)
+    off. Rests are right, whatever a filter does to the tone."""
     found, S = turned_by_hand(response, shaken_mps2, one_in, **stated)
     assert found.status == "valid", found.reasons
     assert found.reference_frequency_hz == 0.0
@@ -74,7 +74,13 @@ def test_s_at_0_hz_is_told_by_rests_alone(
 
 @pytest.mark.parametrize(
     ("response", "shaken_mps2"),
-    [(lowpass(1, 22.4), 2.8), (lowpass(2, 11.1), 1.0), (lowpass(1, 24.0), 0.21), (lowpass(2, 25.4), 0.87)],
+    [
+        (lowpass(1, 22.4), 2.8),
+        (lowpass(2, 11.1), 1.0),
+        (lowpass(1, 24.0), 0.21),
+        (lowpass(2, 25.4), 0.87),
+        (lowpass(4, 12.0), 0.1),
+    ],
 )
 def test_one_tone_in_all_stays_tells_s_at_its_frequency(response: Filter, shaken_mps2: float) -> None:
     """Each window of a tone on an ellipse fits several lags, each with another S. The search gave each window a lag of
@@ -85,13 +91,6 @@ def test_one_tone_in_all_stays_tells_s_at_its_frequency(response: Filter, shaken
     assert at_hz == pytest.approx(TONE_HZ, abs=0.02)
     away = np.abs(found.sensitivity - S * abs(response(np.array([TONE_HZ]))[0])).ravel()
     assert np.all(away < 4.0 * found.standard_uncertainty[:9])
-
-
-def test_windows_of_one_frequency_without_a_common_lag_are_refused() -> None:
-    """A steep filter near the tone: no S fits the sizes of all windows."""
-    found, _ = turned_by_hand(lowpass(4, 12.0), 0.1, 1)
-    assert found.status == "refused"
-    assert "have no S and no lag in common" in found.reasons[0]
 
 
 def test_a_reversed_reference_is_no_lag_of_half_a_period() -> None:
