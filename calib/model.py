@@ -129,7 +129,7 @@ class Window:
 
     @property
     def silent_noise(self) -> Array:
-        """(3,) noise of channels that were left out of the sums (calib.excitation.excited): none were."""
+        """(3,) noise of channels that were left out of the sums (calib.windows.excited): none were."""
         return np.zeros(3)
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.condense import condense
-from calib.excitation.alignment import drift, u_lag_s
-from calib.excitation.excited import excited, excited_together
-from calib.excitation.sums import window_sums
 from calib.geometry import beside
 from calib.model import Array, Window
+from calib.recorded.alignment import drift, u_lag_s
+from calib.windows.condense import condense
+from calib.windows.excited import excited, excited_together
+from calib.windows.sums import window_sums
 
 RATE_HZ, TONE_HZ, N, NOISE_MPS2, OF_SENSOR = 100.0, 6.6, 500, 0.01, 0.01
 OMEGA = 2.0 * np.pi * TONE_HZ
