@@ -25,6 +25,7 @@ from calib.windows.excited import excited_together
 PER_OCTAVE = 6  # bands, as many as those of a window
 NARROW = 1.5  # ends of a window's band, so near that it stands for its middle; those of short windows are wider
 UNSEEN = 1e-6  # part of an element of S that lies in directions which no window excited
+MOST_CHANGE = 0.5  # of ln S, from the mean frequency of the motion in a band to the middle of the band
 
 
 def told_by_band(found: Adjustment, windows: Sequence[Window]) -> ResponseTold | None:
@@ -69,7 +70,7 @@ def _bands(windows: Sequence[_Moved], edges_hz: Array, taken: Complex, stated: A
     rows = [_Rows.of(windows, *end) for end in ends]
     found = [own.solved() for own in rows]
     at_hz = np.array([own.frequency_hz for own in rows])
-    left = _at_the_middles(np.array([own for own, _ in found]), at_hz, np.sqrt(edges_hz[:-1] * edges_hz[1:]))
+    left = at_the_middles(np.array([own for own, _ in found]), at_hz, np.sqrt(edges_hz[:-1] * edges_hz[1:]))
     told = left * taken[:, None, None]
     u = np.hypot([u * abs(h) for (_, u), h in zip(found, taken.tolist(), strict=True)], _within(told))
     return tuple(BandSensitivity(*end, *band) for end, *band in zip(ends, told, np.hypot(u, stated), strict=True))
@@ -135,10 +136,11 @@ class _Rows:
         return (found[:3] + 1j * found[3:]).T, np.hypot(u[:3], u[3:]).T
 
 
-def _at_the_middles(left: Complex, at_hz: Array, middles_hz: Array) -> Complex:
+def at_the_middles(left: Complex, at_hz: Array, middles_hz: Array) -> Complex:
     """Sensitivities (B, 3, 3), each at the mean frequency of the motion in its band, at the middles of the bands.
 
-    The motion of a band may lie at one end of it, and where the response is steep this matters.
+    The motion of a band may lie at one end of it, and where the response is steep this matters. Two bands that show one
+    tone at their common end tell no slope: a sensitivity that would change by more than MOST_CHANGE stays.
     """
     out = left.copy()
     for row, column in np.ndindex(3, 3):
@@ -148,8 +150,9 @@ def _at_the_middles(left: Complex, at_hz: Array, middles_hz: Array) -> Complex:
         if len(told) < 2:
             continue
         x, log = np.log(at_hz[told]), np.log(np.abs(own[told])) + 1j * np.unwrap(np.angle(own[told]))
-        slope = np.gradient(log, x)
-        out[told, row, column] = own[told] * np.exp(slope * (np.log(middles_hz[told]) - x))
+        change = np.gradient(log, x) * (np.log(middles_hz[told]) - x)
+        near = np.abs(change) <= MOST_CHANGE
+        out[told[near], row, column] = own[told[near]] * np.exp(change[near])
     return out
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.adjustment.response_by_band import at_the_middles
 from calib.geometry import beside
 from calib.model import Array, Window
 from calib.recorded.alignment import drift, u_lag_s
@@ -115,3 +116,13 @@ def test_u_of_slopes_has_the_noise_of_channels_that_only_share(of_reference: flo
         z.append((told * data.root[0, 0, 0] / data.type_a.noise[0])[1:])  # x: S_xx with the noise of its own channel
     # 400 squares: the mean is 1 within 3.3 times sqrt(2 / 400); S moves the noise between axes by some per cent
     assert np.mean(np.square(z)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_tone_that_shows_in_two_bands_tells_no_slope_between_them() -> None:
+    """At the common end of two bands it is motion at almost one frequency in both; the slope overflowed."""
+    random = np.random.default_rng(3)
+    at_hz = np.array([10.0, 10.0 + 1e-9, 12.0])
+    left = np.exp(random.normal(size=(3, 3, 3))) + 0j
+    told = at_the_middles(left, at_hz, np.array([9.4, 10.6, 12.0]))
+    assert np.isfinite(told).all()
+    np.testing.assert_array_equal(told[:2], left[:2])
