@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -51,11 +50,6 @@ def consistent(t_s: float = 0.0) -> Evidence:
 def jumped(t_s: float = 0.0) -> Evidence:
     """Far from what the state expected."""
     return Evidence(t_s, 1000.0, DOF)
-
-
-def unsupported(reason: str = "coherence 0.2 below 0.9") -> Evidence:
-    """Nothing to learn from."""
-    return replace(consistent(), supported=False, reason=reason)
 
 
 def within_max_change(now: Calibration, anchor: Calibration, main_pct: float, transverse_pct: float) -> bool:

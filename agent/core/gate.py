@@ -23,16 +23,16 @@ PROPOSALS_KEPT = 8  # so that an operator can accept an estimate after newer one
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What the gate needs of one window: chi-squared of its innovation, with the covariance of the state, and whether
-    its excitation supports an update; if not, `reason` says why. `dismisses`: if it fits, it may dismiss held ones.
-    `enough`: with it the state has seen two windows, or 10 s, which a first calibration needs. `still`: a sentence on
-    the directions in which nothing moved so far, "" where there is none."""
+    """What the gate needs of one window: chi-squared of its innovation, with the covariance of the state.
+
+    `dismisses`: if it fits, it may dismiss held ones. `enough`: with it the state has seen two windows, or 10 s, which
+    a first calibration needs. `still`: a sentence on the directions in which nothing moved so far, "" where there is
+    none.
+    """
 
     t_s: float
     statistic: float
     degrees_of_freedom: float
-    supported: bool = True
-    reason: str = ""
     dismisses: bool = True
     enough: bool = True
     still: str = ""
@@ -151,8 +151,6 @@ class Gate:
         calibration if the state takes all held windows with this one; None if they do not agree with each other, or if
         they are fewer than `confirm_windows` (see Decision.held).
         """
-        if not evidence.supported:
-            return self._decision("refuse", evidence.reason)
         if self._hold:
             return self._decision(
                 "refuse", "an operator put the calibration on hold; no window is used until an operator releases it"

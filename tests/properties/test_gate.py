@@ -15,7 +15,7 @@ from agent.config.gate import GateSettings
 from agent.core.gate import Answer, Decision, Evidence, Gate
 from agent.core.snapshot import pack, unpack
 from calib.model import Calibration
-from tests.gate_rules import NOMINAL, calibration, consistent, jumped, unsupported, within_max_change
+from tests.gate_rules import NOMINAL, calibration, consistent, jumped, within_max_change
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "online.md"
 COMMANDS = ("hold", "release", "accept", "rollback")
@@ -32,9 +32,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
     return calibration(S, draw(st.floats(-10, 10)), u_pct, draw(st.integers(0, 12)))
 
 
-KINDS: tuple[str, ...] = (
-    ("consistent",) * 4 + ("jumped",) * 5 + ("unsupported", "lost", "back", "accept", "accept", "release")
-)
+KINDS: tuple[str, ...] = ("consistent",) * 5 + ("jumped",) * 5 + ("lost", "back", "accept", "accept", "release")
 KINDS += ("hold", "rollback")
 steps = st.lists(
     st.tuples(st.sampled_from(KINDS), calibrations(), st.none() | calibrations(), st.integers(1, 6)), max_size=60
@@ -65,7 +63,7 @@ class Site:
             return self.gate.lose("silent") if kind == "lost" else self.gate.regain("speaks again")
         if kind in COMMANDS:
             return self._command(kind, candidate, self.published[-ago:][:1])
-        evidence: dict[str, Evidence] = {"consistent": consistent(), "jumped": jumped(), "unsupported": unsupported()}
+        evidence: dict[str, Evidence] = {"consistent": consistent(), "jumped": jumped()}
         decision = self.gate.judge(evidence[kind], candidate, confirmed)
         if decision.propose:
             self.published.append(len(self.published) + 1)

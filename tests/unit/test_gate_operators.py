@@ -21,7 +21,6 @@ from tests.gate_rules import (
     held,
     jumped,
     scaled,
-    unsupported,
     valid,
 )
 
@@ -110,7 +109,7 @@ def test_a_lost_sensor_is_invalid_and_comes_back_to_what_it_was() -> None:
         assert g.lose("unplugged").status == "INVALID"
         answer = g.regain("speaks again")
         assert (answer.status, answer.reason) == (back, "speaks again")
-        assert g.judge(unsupported(), NEAR).held == 0
+        assert g.judge(jumped(), FAR).held == 1  # the one before is forgotten
 
 
 def test_the_state_is_plain_and_comes_back_bit_for_bit() -> None:
