@@ -49,7 +49,7 @@ IN_TURNS = (
 )
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
-Kind = Literal["drifting", "held", "no data", "silent", "uncalibrated", "sound"]
+Kind = Literal["drifting", "changed", "held", "doubled", "no data", "silent", "uncalibrated", "sound"]
 
 SHOWN = {"status", "calibration", "good window"}  # a sensor of which none is known, and no drift, has no row
 
@@ -163,6 +163,11 @@ class Fleet:
         with self._mutex:
             return _verdicts(self._newest.get(place, {}))
 
+    def status(self, place: Place) -> str:
+        """The newest status of a sensor; "" where none is known."""
+        with self._mutex:
+            return str(self._newest.get(place, {}).get("status", {}).get("status", ""))
+
     def beside(self, place: Place) -> dict[str, int]:
         """Of the other sensors whose newest windows had the same reference: how many there are (`count`), and how many
         of them have a main sensitivity that drifts or stepped (`changed`)."""
@@ -208,8 +213,11 @@ class Fleet:
         whose name two gateways publish in turns."""
         found, turns = {_place(source): count for source, count in doubled.items()}, set(map(_place, in_turns))
         with self._mutex:
+            changed = found.keys() ^ self._doubled.keys() | turns ^ self._in_turns
             self.version += (found, turns) != (self._doubled, self._in_turns)
             self._doubled, self._in_turns = found, turns
+            for gateway in changed:
+                self._touch_gateway(gateway)
 
     def set_told(self, site: str, gateway: str, status: bytes) -> None:
         """What a gateway says of itself, as JSON; what is no such status is ignored."""
@@ -250,9 +258,12 @@ class Fleet:
 
     def _row_of(self, place: Place) -> dict[str, Any]:
         if place not in self._made:
-            heard = place not in self._silent and place[:2] in self._alive
+            gateway = place[:2]
+            heard = place not in self._silent and gateway in self._alive
+            doubled = self._doubled.get(gateway, 1) > 1 or gateway in self._in_turns
             of = {"heard_utc_ns": self._heard[place].at_ns, "changed": self._changed[place]}
-            self._made[place] = _row(place, self._newest[place], self._state_of(place[:2]), heard=heard) | of
+            row = _row(place, self._newest[place], self._state_of(gateway), heard=heard, doubled=doubled)
+            self._made[place] = row | of
         return self._made[place]
 
     def _touch(self, place: Place) -> None:
@@ -318,25 +329,34 @@ def _verdicts(newest: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     return [f for part, f in newest.items() if part.startswith("drift ") and f["verdict"] != "stable"]
 
 
-def kind_of(verdicts: Collection[str], status: str, *, heard: bool) -> Kind:
-    """The kind of a sensor: what it counts as on the page. `verdicts`: "drifting" or "stepped".
+def kind_of(verdicts: Collection[str], status: str, *, heard: bool, doubled: bool = False) -> Kind:
+    """The kind of a sensor: what it counts as on the page. `verdicts`: "drifting" or "stepped"; `doubled`: two gateways
+    have the name of its own, so nobody knows whose results these are.
 
-    Held windows are what shows a step, so a sensor that is held and has stepped is held.
+    Held windows are what shows a step, so a sensor that is held and has stepped is held. One whose step was adopted has
+    changed: of a drift, too, a part may be told as a step (trends.change_in).
     """
     if not heard:
         return "silent"
-    if "drifting" in verdicts or (verdicts and status != "HELD"):
+    if doubled:
+        return "doubled"
+    if "drifting" in verdicts:
         return "drifting"
+    if verdicts and status != "HELD":
+        return "changed"
     return _OF_STATUS.get(status, "uncalibrated")
 
 
 _OF_STATUS: dict[str, Kind] = {"VALID": "sound", "RECALIBRATING": "sound", "HELD": "held", "INVALID": "no data"}
 
 
-def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *, heard: bool) -> dict[str, Any]:
+def _row(
+    place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *, heard: bool, doubled: bool
+) -> dict[str, Any]:
     status, calibration = newest.get("status", {}), newest.get("calibration", {})
     verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
     reference, calibrated_utc_ns = dated(_reference(newest))
+    told = [drift["verdict"] for drift in verdicts]
     why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
     if status.get("status") in NEEDS_A_PERSON:
         why.insert(0, f"{status['status']}: {status['reason']}")
@@ -344,11 +364,13 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *,
         why.append("the gateway is not on the bus")
     elif not heard:
         why.append(f"no result for {SILENT_INTERVALS} intervals")
+    if doubled:
+        why.append("two gateways have one name")
     return {
         "site": place[0],
         "gateway": place[1],
         "sensor": place[2],
-        "kind": kind_of([drift["verdict"] for drift in verdicts], status.get("status", ""), heard=heard),
+        "kind": kind_of(told, status.get("status", ""), heard=heard, doubled=doubled),
         "status": status.get("status", ""),
         "status_utc_ns": status.get("t_utc_ns"),
         "reason": clipped(status.get("reason", "")),
@@ -357,6 +379,7 @@ def _row(place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *,
         "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
         "u_pct": _u_pct(calibration),
         "band_hz": calibration.get("valid_band_hz", []),
+        "calibration_utc_ns": calibration.get("t_utc_ns"),
         "reference": clipped(reference),
         "calibrated_utc_ns": calibrated_utc_ns,
         "estimate": newest.get("estimate", {}).get("sequence"),
@@ -417,6 +440,7 @@ def _gateway_row(
         "told_utc_ns": told.t_utc_ns if told else None,
         "refused": refused,
         "instances": instances,
+        "in_turns": in_turns,
         "why": "; ".join(why),
     }
 

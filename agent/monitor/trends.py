@@ -21,6 +21,8 @@ POINTS = 400  # of the history to which a change is fitted
 YEAR_DAYS = 366
 KEPT_FOR_S, KEPT_MAX = 60.0, 2000  # for so long, and of so many sensors, what was found is used again
 STATUSES = 200  # changes of status that are looked at
+WINDOWS = 400  # windows among which those that are held are looked for, the newest
+ESTIMATES = 12  # that are shown beyond the calibration in force
 # Source of a budget that results of one reference share (calib.estimate.quantities).
 OF_REFERENCE = "reference sensitivity"
 Shape = Literal["drifting", "stepped"]
@@ -37,13 +39,15 @@ class Trends:
     def of(self, place: Place) -> dict[str, Any]:
         """`t_utc_ns` (n) and `main_pct` (3, n): a year of the main sensitivities as changes since the calibration of
         `accepted_utc_ns`; `changes`: of each parameter its change and U of that; `budget`: what makes u of the main
-        sensitivities (3), by source; `found`: of each verdict what the
-        history tells; `held_utc_ns`: since when the status is what it is; `beside`: Fleet.beside.
+        sensitivities (3), by source; `found`: of each verdict what the history tells; `held_utc_ns`: since when the
+        status is what it is; `adopted_utc_ns`: when a jump last came into force; `beside`: Fleet.beside. Where the
+        status is HELD also `refused_utc_ns`: when a window since then was not used, thinned; and `estimates`: the
+        newest ones after the calibration in force, each with `t_utc_ns`, `main_pct` (3), `values` and `u` (12).
 
         {} where no calibration is known.
         """
         verdicts = self._fleet.verdicts(place)
-        key = place, str([(v["parameter"], v["verdict"]) for v in verdicts])
+        key = place, str([self._fleet.status(place), *((v["parameter"], v["verdict"]) for v in verdicts)])
         kept_s, found = self._kept.get(key, (-KEPT_FOR_S, {}))
         if time.monotonic() - kept_s >= KEPT_FOR_S:
             found = self._found(place, verdicts)
@@ -61,6 +65,7 @@ class Trends:
         from_then = [c for c in history if c["t_utc_ns"] >= accepted] or history[-1:]
         first, last = from_then[0], history[-1]
         ends = self._with_budget(place, first), self._with_budget(place, last)
+        held = _lasting(statuses) if statuses and statuses[-1]["status"] == "HELD" else None
         year = [c for c in history if c["t_utc_ns"] > last["t_utc_ns"] - YEAR_DAYS * DAY_NS]
         shown = [year[k] for k in _thinned(len(year))]
         return {
@@ -71,10 +76,29 @@ class Trends:
             "changes": [change_of(*ends, i) for i in range(len(PARAMETERS))],
             "budget": {source: [u[i] for i in MAIN] for source, u in ends[1].get("budget", {}).items()},
             "held_utc_ns": _lasting(statuses),
+            "adopted_utc_ns": max((s["t_utc_ns"] for s in statuses if _adopts(s)), default=None),
             "certificate_utc_ns": _certificate_since(history),
             "found": {v["parameter"]: _trend(v, from_then, ends) for v in verdicts},
             "beside": self._fleet.beside(place),
-        }
+        } | ({} if held is None else self._beyond(place, held, first, last))
+
+    def _beyond(
+        self, place: Place, held_utc_ns: int, first: Mapping[str, Any], last: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """What a sensor that is held says beyond its calibration in force, the `last` one."""
+        windows = self._database.history(*place, "window", WINDOWS)
+        refused = [w["t_utc_ns"] for w in windows if not w["used"] and w["t_utc_ns"] >= held_utc_ns]
+        told = [e["calibration"] for e in self._database.history(*place, "estimate", ESTIMATES)]
+        return {
+            "refused_utc_ns": [refused[k] for k in _thinned(len(refused))],
+            "estimates": [
+                {
+                    "t_utc_ns": c["t_utc_ns"], "main_pct": [_pct(first, c, i) for i in MAIN],
+                    "values": [value_of(c, i) for i in range(len(PARAMETERS))], "u": c["standard_uncertainty"],
+                }
+                for c in told if c["t_utc_ns"] > last["t_utc_ns"]
+            ],
+        }  # fmt: skip
 
     def _with_budget(self, place: Place, calibration: dict[str, Any]) -> dict[str, Any]:
         """The calibration with the budget of its day, which the first one of the day has."""
@@ -133,6 +157,11 @@ def _lasting(statuses: Sequence[Mapping[str, Any]]) -> int | None:
             break
         lasting = told["t_utc_ns"]
     return lasting
+
+
+def _adopts(status: Mapping[str, Any]) -> bool:
+    """Whether a jump came into force."""
+    return bool(status["status"] == "RECALIBRATING" and status["before"] != "RECALIBRATING")
 
 
 def change_in(days: Array, values: Array, verdict: Mapping[str, Any]) -> tuple[Shape, Since | None]:

@@ -36,6 +36,12 @@ PASSWORD = "correct horse battery staple"
 PICTURE = IMAGES / "report.png"
 RISES_S = 2.0
 SILENT_S = 10.0
+# What has risen is shown when it is asked for; a click by a script leaves the focus where it is.
+ASKED_AND_FIRST = """name => {
+    const asked = document.getElementById('new-cards');
+    if (!asked.hidden) asked.click();
+    return document.querySelector('#cards a')?.textContent === name;
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +93,7 @@ def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_pat
         kept = held.element_handle()
         shown.rounds(1)  # its step is told now
         begun = time.monotonic()
-        page.wait_for_function("name => document.querySelector('#cards a')?.textContent === name", arg=stepped)
+        page.wait_for_function(ASKED_AND_FIRST, arg=stepped)
         assert time.monotonic() - begun < RISES_S
         assert kept.evaluate("link => link.isConnected && link === document.activeElement")  # no row is rebuilt
         page.locator("#cards .card").first.filter(has_text="fell by 2.97 %").wait_for()  # 3 % in truth
@@ -250,6 +256,8 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
         gateway.kill()
         gateway.wait()
         begun = time.monotonic()
+        page.get_by_role("button", name="1 not heard").wait_for()
+        page.locator("#new-cards", has_text="1 new").click()
         page.locator("#cards", has_text="Not heard since").wait_for()
         assert time.monotonic() - begun < SILENT_S
         history = monitor.get(asked)

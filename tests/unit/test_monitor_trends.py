@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.core.events import DriftReport
+from agent.core.events import DriftReport, Estimate
 from agent.delivery.keys import Address
 from agent.delivery.received import Received
 from agent.monitor.database import DAY_NS, Database
@@ -18,7 +18,7 @@ from agent.monitor.fleet import Fleet, dated
 from agent.monitor.onset import since
 from agent.monitor.trends import Trends, change_in, change_of
 from calib.state.state import DATED
-from tests.unit.results import calibration, status
+from tests.unit.results import calibration, status, window
 
 PLACE = ("site", "gw", "mems")
 NOW_NS = 1_700_000_000_000_000_000
@@ -137,7 +137,11 @@ def test_a_sensor_that_is_held_and_has_stepped_is_held() -> None:
     (row,) = fleet.rows()
     assert [v["verdict"] for v in row["verdicts"]] == ["stepped"]  # with its step
     fleet.take(*PLACE, "status", fields_of(status(2, "VALID")))
-    assert kind(fleet) == "drifting"  # an adopted step needs a person too
+    assert kind(fleet) == "changed"  # an adopted step needs a person too, and does not drift
+    fleet.set_doubled({"site/gw": 2})
+    assert kind(fleet) == "doubled"  # of two gateways with one name nobody knows whose results these are
+    fleet.set_doubled({})
+    assert kind(fleet) == "changed"
 
 
 def test_a_gateway_that_catches_up_needs_no_person() -> None:
@@ -223,3 +227,49 @@ def test_what_a_history_tells_of_a_drift(tmp_path: Path, told: str) -> None:
     assert change["u_size"] == pytest.approx(0.5 * found["changes"][0]["U"], rel=0.02)
     assert change["u_rate"] == pytest.approx(change["u_size"] / 165, rel=0.05)
     assert found["found"]["Sxx"]["scale"] == pytest.approx(26154 + 431, abs=5)
+
+
+def test_what_is_held_is_told_beyond_the_calibration_in_force_and_at_once(tmp_path: Path) -> None:
+    """Ten sound days, then ten in which windows are held; from the fifth of them on with an estimate."""
+    fleet, database = Fleet(), Database(Sqlite(tmp_path / "monitor.sqlite"), full_days=1000)
+    trends, begin = Trends(database, fleet), NOW_NS - 20 * DAY_NS
+
+    def take(result: Any, number: int, day: int, **more: Any) -> None:
+        fields, t_utc_ns = fields_of(result), begin + day * DAY_NS
+        fields |= {"t_utc_ns": t_utc_ns, "sequence": number} | more
+        if "calibration" in fields:
+            fields["calibration"]["t_utc_ns"] = t_utc_ns
+        database.add([Received("", Address(*PLACE, result.what), number, fields, None)])
+        fleet.take(*PLACE, result.what, fields)
+
+    take(status(1), 1, 0)
+    for day in range(10):
+        take(window(1), 10 * day + 2, day)
+        take(calibration(1), 10 * day + 3, day)
+    assert "estimates" not in trends.of(PLACE)
+    for day in range(10, 20):
+        take(window(1, used=False, reason="held"), 10 * day + 2, day)
+        take(status(1, "HELD"), 10 * day + 3, day)
+        if day > 13:
+            made = Estimate(run_id="r", sequence=1, sensor="mems", t_utc_ns=1, reason="r",
+                            calibration=calibration(1, sxx=0.9 * 26154.0))  # fmt: skip
+            take(made, 10 * day + 4, day)
+    found = trends.of(PLACE)  # although what was found of the sound sensor is kept for a minute
+    database.close()
+    days = [begin + day * DAY_NS for day in range(20)]
+    assert (found["held_utc_ns"], found["refused_utc_ns"]) == (days[10], days[10:])
+    assert [e["t_utc_ns"] for e in found["estimates"]] == days[14:]
+    assert found["estimates"][0]["main_pct"] == [-10.0, 0.0, 0.0]
+    assert [found["estimates"][0][name][0] for name in ("values", "u")] == [0.9 * 26154.0, 6.0]
+    assert found["t_utc_ns"][-1] == days[9]
+
+
+def test_when_a_jump_came_into_force(tmp_path: Path) -> None:
+    fleet, database = Fleet(), Database(Sqlite(tmp_path / "monitor.sqlite"), full_days=1000)
+    kept = [calibration(1), *(status(k, "RECALIBRATING") for k in (2, 3))]
+    for number, (result, before) in enumerate(zip(kept, ("", "HELD", "RECALIBRATING"), strict=True), start=1):
+        fields = fields_of(result, before=before)
+        database.add([Received("", Address(*PLACE, result.what), number, fields, None)])
+        fleet.take(*PLACE, result.what, fields)
+    assert Trends(database, fleet).of(PLACE)["adopted_utc_ns"] == kept[1].t_utc_ns
+    database.close()

@@ -1,11 +1,12 @@
 // The fleet view: counts by kind, cards of what needs a person, all sensors by gateway, and the gateways.
 import { $, clean, full, get, make, placeOf, table, text, view } from "./common.js";
-import { ago, AXES, band, day, DAY_NS, finite, MAIN, now, signed, two } from "./format.js";
+import { ago, AXES, band, day, DAY_NS, finite, now, signed, two } from "./format.js";
 import { card, chip, KINDS, spark, tile } from "./parts.js";
 import { saveTable } from "./picture.js";
-import { cardPlot, certificate, shortName, stateOf, steps, timeOf, told as toldOf } from "./words.js";
+import { cardPlot, certificate, covered, largest, NO_VERDICT, ofDoubled, shortName, stateOf, steps, timeOf, told as toldOf } from "./words.js";
 
-const WORST = ["drifting", "held", "no data", "silent", "uncalibrated"]; // kinds that need a person, the worst first
+const WORST = ["drifting", "held", "doubled", "changed", "no data", "silent", "uncalibrated", "gateway"]; // the worst first
+const LET_GO_MS = 600000; // after which nobody is taken to look at a page that was not touched, as on a wall
 const CARDS = 5; // that are shown at once; more by a button
 const SCALE_PCT = 1; // of the small plots of the table, all alike
 const AGAIN_MS = 60000; // after which the histories of rows that are seen are asked for again
@@ -15,6 +16,7 @@ let shownCards = CARDS;
 const groups = new Map(); // by site/gateway: {element, body, rows, built, open}
 const trends = new Map(); // by name: {at, told}; what the histories of seen sensors tell
 const cards = new Map(); // by key: {element, from}
+let order = null, orderFor = "", touchedAt = performance.now(); // keys of the cards that are shown, for which filter
 
 const gatewayOf = (row) => `${row.site}/${row.gateway}`;
 const put = (element, content) => { if (element.textContent !== content) element.replaceChildren(text(content)); };
@@ -27,7 +29,7 @@ function wanted(row, filter) {
 
 function showCounts(sensors, kind, go) {
   const count = (one) => sensors.filter((row) => row.kind === one).length;
-  const kinds = ["sound", "drifting", "held", "silent", ...["no data", "uncalibrated"].filter(count)];
+  const kinds = ["sound", "drifting", "held", "silent", ...["changed", "doubled", "no data", "uncalibrated"].filter(count)];
   const key = JSON.stringify([kinds.map(count), sensors.length, kind]);
   if ($("counts").dataset.key === key) return;
   const focused = [...$("counts").children].indexOf(document.activeElement);
@@ -39,50 +41,62 @@ function showCounts(sensors, kind, go) {
 
 // --- cards
 
-// A card for each sensor, or for a gateway whose sensors are not heard; the worst first.
+// A card for each sensor, or for a gateway whose sensors are not heard or are mixed with others; the worst first.
 function needs(sensors, gateways) {
-  const rank = (row) => WORST.indexOf(row.kind), found = [];
+  const rank = (row) => WORST.indexOf(row.kind), byGateway = ["silent", "doubled"], found = [], kindOf = (gateway) => (gateway.instances > 1 || gateway.in_turns ? "doubled" : "gateway");
   const silent = Map.groupBy(sensors.filter((row) => row.kind === "silent"), gatewayOf);
-  for (const row of sensors.filter((one) => rank(one) >= 0 && one.kind !== "silent")) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? 0 });
-  for (const [name, rows] of silent) found.push({ key: `gateway ${name}`, row: rows[0], rows, rank: WORST.indexOf("silent"), size: rows.length });
-  for (const gateway of gateways.filter((g) => g.why && g.alive)) found.push({ key: `state ${gatewayOf(gateway)}`, gateway, rank: WORST.length, size: 0 });
+  for (const row of sensors.filter((one) => rank(one) >= 0 && !byGateway.includes(one.kind))) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? 0 });
+  for (const [name, rows] of silent) found.push({ key: `gateway ${name}`, row: rows.reduce((a, b) => ((b.last_good_utc_ns ?? 0) < (a.last_good_utc_ns ?? 0) ? b : a)), rows, rank: WORST.indexOf("silent"), size: rows.length });
+  for (const gateway of gateways.filter((g) => g.why && g.alive)) found.push({ key: `state ${gatewayOf(gateway)}`, gateway, kind: kindOf(gateway), rank: WORST.indexOf(kindOf(gateway)), size: 0 });
   return found.sort((a, b) => a.rank - b.rank || b.size - a.size || (a.key < b.key ? -1 : 1));
 }
 
-function drawn({ row, rows, gateway }) {
-  if (gateway) return card({ kind: "gateway", name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`, say: gateway.why, more: [], plot: [], steps: [make("p", "The state of a gateway says what to do: see docs/operation.md.")] });
-  const found = trends.get(full(row))?.told, { say, more } = toldOf(row, found);
+// What is said of a gateway beside why.
+const ofGateway = (kind) => (kind !== "doubled" ? { steps: [make("p", "The state of a gateway says what to do: see docs/operation.md.")] } : {
+  usable: ["bad", [make("b", "Values of its sensors may not be used"), ": nobody knows whose calibration is shown."]], steps: ofDoubled(),
+});
+
+function drawn({ row, rows, gateway, kind }) {
+  if (gateway) return card({ kind, name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`, say: `${gateway.why}.`, more: [], plot: null, ...ofGateway(kind) });
+  const found = trends.get(full(row))?.told, { say, more } = toldOf(row, found), usable = covered(row, found);
   if (rows) {
     const moved = rows.filter((one) => one.verdicts.length).map((one) => one.sensor), names = rows.slice(0, 6).map((one) => one.sensor).join(", ");
-    return card({ kind: "silent", name: `gateway ${gatewayOf(row)}`, where: `${rows.length} sensors: ${names}${rows.length > 6 ? ", …" : ""}`, say, more: moved.length ? `Before it fell silent ${moved.slice(0, 6).join(", ")} drifted.` : "Before it fell silent no drift was found.", plot: [], steps: steps(row, found) });
+    return card({ kind: "silent", name: `gateway ${gatewayOf(row)}`, where: `${rows.length} sensors: ${names}${rows.length > 6 ? ", …" : ""}`, say, usable, more: moved.length ? `Before it fell silent ${moved.slice(0, 6).join(", ")} drifted.` : "Before it fell silent no drift was found.", plot: null, steps: steps(row, found) });
   }
   const name = make("a", `${clean(row.gateway)} / ${clean(row.sensor)}`, { href: `#${placeOf(row)}` });
-  return card({ kind: row.kind, name, where: `${clean(row.site)}${row.reference ? `, reference ${clean(row.reference)}` : ""}`, say, more, plot: cardPlot(row, found), steps: steps(row, found) });
+  return card({ kind: row.kind, name, where: `${clean(row.site)}${row.reference ? `, reference ${clean(row.reference)}` : ""}`, say, usable, more, plot: cardPlot(row, found), steps: steps(row, found) });
 }
 
+// A card that comes, goes or moves would push what a person reads. So it is told beside the heading, and comes when it is
+// asked for, or where nobody looks.
+const nobodyLooks = () => document.hidden || performance.now() - touchedAt > LET_GO_MS;
+
 function showCards(sensors, gateways, filter) {
-  const all = needs(sensors.filter((row) => wanted(row, filter)), filter.kind || filter.words ? [] : gateways), shown = all.slice(0, shownCards);
-  $("needs").hidden = all.length === 0;
-  put($("needs-count"), `Needs a person: ${all.length}`);
-  for (const need of shown) {
-    const from = JSON.stringify([need.row?.changed, need.rows?.map((row) => row.changed), need.gateway, trends.get(need.row && full(need.row))?.at]);
-    const before = cards.get(need.key);
-    if (before?.from === from) continue;
-    const inHand = before?.element.contains(document.activeElement) || before?.element.contains(getSelection().anchorNode) && !getSelection().isCollapsed;
-    if (inHand) continue; // it is drawn anew when the person has let go of it
+  const all = needs(sensors.filter((row) => wanted(row, filter)), filter.kind || filter.words ? [] : gateways), known = new Map(all.map((need) => [need.key, need]));
+  const best = all.slice(0, shownCards).map((need) => need.key), asked = JSON.stringify([filter, shownCards]);
+  if (!order || asked !== orderFor || nobodyLooks()) { order = sensors.length ? best : null; orderFor = asked; }
+  const keys = order ?? [], come = best.filter((key) => !keys.includes(key)).length, over = keys.filter((key) => !known.has(key)).length;
+  const differs = [come && `${come} new`, over && `${over} over`].filter(Boolean).join(", ");
+  put($("needs-count"), all.length ? `Needs a person: ${all.length}` : "Nothing needs a person");
+  $("new-cards").hidden = !differs && best[0] === keys[0];
+  put($("new-cards"), differs ? `${differs}: show` : "Another is the worst: sort");
+  for (const key of keys) {
+    const need = known.get(key), before = cards.get(key);
+    const from = need && JSON.stringify([need.row?.changed, need.rows?.map((row) => row.changed), need.gateway, trends.get(need.row && full(need.row))?.at]);
+    if (before?.from === from || (before && inHand(before.element))) continue; // it is drawn anew when the person has let go of it
+    if (!need) { before?.element.querySelector(".chip").replaceWith(chip("over")); if (before) before.from = from; continue; }
     const element = drawn(need);
     before?.element.replaceWith(element);
-    cards.set(need.key, { element, from });
+    cards.set(key, { element, from });
   }
-  const keys = new Set(shown.map((need) => need.key));
-  for (const [key, { element }] of cards) if (!keys.has(key)) { element.remove(); cards.delete(key); }
-  shown.forEach((need, i) => {
-    const { element } = cards.get(need.key), there = $("cards").children[i];
+  for (const [key, { element }] of cards) if (!keys.includes(key)) { element.remove(); cards.delete(key); }
+  keys.filter((key) => cards.has(key)).forEach((key, i) => {
+    const { element } = cards.get(key), there = $("cards").children[i];
     if (there !== element) $("cards").insertBefore(element, there ?? null);
   });
-  $("more-cards").hidden = all.length <= shown.length;
-  put($("more-cards"), `Show ${all.length - shown.length} more`);
-  ask(shown.filter((need) => need.row && !need.rows).map((need) => need.row));
+  $("more-cards").hidden = all.length <= shownCards;
+  put($("more-cards"), `Show ${all.length - shownCards} more`);
+  ask(keys.map((key) => known.get(key)).filter((need) => need?.row).map((need) => need.row));
 }
 
 // --- what the histories tell, asked for when a row is seen
@@ -146,11 +160,9 @@ class Row {
     if (!told.t_utc_ns) return;
     const from = now() - 366 * DAY_NS;
     AXES.forEach((axis, i) => this.cells[axis].replaceChildren(spark(`S${axis}${axis} over a year`, [{ t: told.t_utc_ns, v: told.main_pct[i], tone: axis }], [from, now(), -SCALE_PCT, SCALE_PCT])));
-    const over = MAIN.map((i, k) => ({ ...told.changes[i], pct: told.main_pct[k].at(-1) })).filter((c) => finite(c.change) && c.U > 0);
-    const most = over.sort((a, b) => Math.abs(b.change) / b.U - Math.abs(a.change) / a.U)[0];
-    const U = most && Math.abs((most.pct * most.U) / most.change);
-    put(this.cells.change, most ? `${signed(most.pct, finite(U) && U > 0 ? U : 0.01)} %` : "");
-    put(this.cells.over, most ? `${(Math.abs(most.change) / most.U).toFixed(1)} U` : "");
+    const most = largest(told), unjudged = most?.over > 1 && this.row.kind === "sound";
+    put(this.cells.change, most ? `${signed(most.pct, most.U)} %` : "");
+    this.cells.over.replaceChildren(...(most ? [text(`${most.over.toFixed(1)} U`), ...(unjudged ? [make("small", "no verdict", { title: NO_VERDICT })] : [])] : []));
     this.refer();
   }
 
@@ -257,11 +269,15 @@ function picture() {
   saveTable(make("table", [make("tr", heads), ...rows.map((cells) => make("tr", cells))]), "fleet.png");
 }
 
+export const leave = () => { order = null; };
+
 export function start() {
   $("filter").addEventListener("input", () => changing({ filter: $("filter").value }));
   $("filters").addEventListener("submit", (event) => event.preventDefault());
   $("fleet-png").addEventListener("click", picture);
   $("more-cards").addEventListener("click", () => { shownCards += 20; show(latest, changing); });
+  $("new-cards").addEventListener("click", () => { order = null; show(latest, changing); });
+  for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchmove"]) addEventListener(name, () => { touchedAt = performance.now(); }, { passive: true });
   $("fold").addEventListener("click", () => {
     const open = [...groups.values()].some((group) => group.open);
     for (const group of groups.values()) if (group.open === open) group.button.click();

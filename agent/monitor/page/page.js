@@ -68,7 +68,8 @@ function joined(answer) {
   setNow(answer.now_utc_ns);
   const rows = new Map((told?.sensors ?? []).map((row) => [full(row), row])), many = rows.size;
   for (const row of answer.sensors) rows.set(full(row), row);
-  const sensors = [...rows.values()];
+  const sensors = [...rows.values()], reached = new Map(answer.gateways.map((g) => [`${g.site}/${g.gateway}`, g.told_utc_ns]));
+  for (const row of sensors) row.gateway_utc_ns = reached.get(`${row.site}/${row.gateway}`);
   if (rows.size !== many) sensors.sort((a, b) => (full(a) < full(b) ? -1 : 1));
   return { ...answer, sensors };
 }

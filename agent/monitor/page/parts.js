@@ -2,12 +2,20 @@
 import { make, text } from "./common.js";
 import { finite } from "./format.js";
 
-// What a sensor counts as (agent.monitor.fleet): its words, and its colour.
+// What a sensor counts as (agent.monitor.fleet): its words, its colour, and what they mean. The last two are of cards.
 export const KINDS = {
-  sound: ["in order", "ok"], drifting: ["drifting", "bad"], held: ["held", "warn"], silent: ["not heard", "off"],
-  "no data": ["no data", "bad"], uncalibrated: ["not calibrated", "off"], gateway: ["gateway", "warn"],
+  sound: ["in order", "ok", "windows fit the calibration in force, and no drift is found"],
+  drifting: ["drifting", "bad", "S or Q changes slowly; the calibration follows, and U covers it"],
+  changed: ["changed", "bad", "S or Q has changed at once, and the change was adopted"],
+  held: ["held", "warn", "new windows contradict the calibration in force, or an operator put it on hold"],
+  silent: ["not heard", "off", "the gateway has left the bus, or three intervals have no result"],
+  "no data": ["no data", "bad", "the gateway gets no samples of the sensor"],
+  uncalibrated: ["not calibrated", "off", "no calibration is in force yet"],
+  doubled: ["two of one name", "bad", "two gateways have one name, so nobody knows whose results these are"],
+  gateway: ["gateway", "warn", "the gateway itself needs a person"],
+  over: ["over", "off", "this no longer needs a person"],
 };
-export const chip = (kind) => make("span", KINDS[kind][0], { class: `chip ${KINDS[kind][1]}` });
+export const chip = (kind) => make("span", KINDS[kind][0], { class: `chip ${KINDS[kind][1]}`, title: KINDS[kind][2] });
 
 // A count of a kind, which is a filter.
 export const tile = (title, count, tone, pressed, click) => make("button", [make("b", count), make("span", title)], { type: "button", class: `tile ${tone}`, "aria-pressed": String(pressed), click });
@@ -18,11 +26,15 @@ export function copier(line) {
   return make("div", [make("code", line, { tabindex: "0" }), make("button", "Copy", { type: "button", click, "aria-label": `Copy: ${line}` }), told], { class: "command" });
 }
 
-// A card of what needs a person. `say`: the sentence; `more`: what else is known; `steps`: what to do.
-export function card({ kind, name, where, say, more, plot, steps }) {
+// Whether values may be used, as words.js says it.
+export const may = ([tone, sentence]) => make("p", sentence, { class: `may ${tone}` });
+
+// A card of what needs a person. `say`: the sentence; `usable`: of its values; `more`: what else is known; `plot`:
+// elements; null where there is none; `steps`: what to do.
+export function card({ kind, name, where, say, usable, more, plot, steps }) {
   return make("article", [
-    make("div", [make("h3", [name, " ", chip(kind)]), make("p", where, { class: "where" }), make("p", say, { class: "say" }), make("p", more, { class: "more" })]),
-    make("div", plot, { class: "card-plot" }), make("div", [make("h4", "What to do"), ...steps], { class: "do" }),
+    make("div", [make("h3", [name, " ", chip(kind)]), make("p", where, { class: "where" }), make("p", say, { class: "say" }), ...(usable ? [may(usable)] : []), make("p", more, { class: "more" })]),
+    ...(plot ? [make("div", plot, { class: "card-plot" })] : []), make("div", [make("h4", "What to do:"), ...steps], { class: "do" }),
   ], { class: `card need ${KINDS[kind][1]}` });
 }
 
@@ -33,18 +45,20 @@ function drawn(tag, attributes) {
   return element;
 }
 
-// A small plot. `curves`: [{t, v, u, tone}], u: half the band; `range`: [from, to, low, high]; `marks`: times.
-export function spark(label, curves, [from, to, low, high], marks = [], height = 24) {
+// A small plot. `curves`: [{t, v, u, tone, dashed}], u: half the band; `range`: [from, to, low, high]; `marks`: times, as
+// lines; `refused`: times of windows, as points at the lower edge.
+export function spark(label, curves, [from, to, low, high], marks = [], height = 24, refused = []) {
   const plot = drawn("svg", { viewBox: `0 0 100 ${height}`, preserveAspectRatio: "none", role: "img", "aria-label": label, class: "spark" });
   const x = (t) => (100 * (t - from)) / (to - from || 1), y = (v) => Math.min(height, Math.max(0, (height * (high - v)) / (high - low || 1)));
   const line = (points) => points.map(([a, b]) => `${x(a).toFixed(1)},${y(b).toFixed(1)}`).join(" ");
   plot.append(drawn("line", { x1: 0, x2: 100, y1: y(0), y2: y(0), class: "zero" }));
-  for (const { t, v, u, tone } of curves) {
+  for (const { t, v, u, tone, dashed } of curves) {
     const known = t.map((each, k) => [each, v[k], u?.[k]]).filter(([each, value]) => each >= from && finite(value));
     const edge = (sign) => known.map(([each, value, half]) => [each, value + sign * half]);
     if (u && known.every(([, , half]) => finite(half))) plot.append(drawn("polygon", { points: line([...edge(1), ...edge(-1).reverse()]), class: `band ${tone}` }));
-    plot.append(drawn("polyline", { points: line(known), class: `curve ${tone}` }));
+    plot.append(drawn("polyline", { points: line(known), class: `curve ${tone}${dashed ? " dashed" : ""}` }));
   }
+  for (const t of refused) plot.append(drawn("polygon", { points: `${x(t) - 0.8},${height} ${x(t) + 0.8},${height} ${x(t)},${height - 5}`, class: "refused" }));
   for (const t of marks) plot.append(drawn("line", { x1: x(t), x2: x(t), y1: 0, y2: height, class: "mark" }));
   return plot;
 }

@@ -12,8 +12,8 @@ export function boxOf(label) {
   return make("div", [], { role: "group", "aria-label": label, class: "plot" });
 }
 
-// Plots over time that all show the same range of it. A plot is {title, unit, height, series, marks}; a series {label,
-// values, u, tone}, u: standard uncertainties; a mark {t, text, alarm}.
+// Plots over time that all show the same range of it. A plot is {title, unit, height, series, marks, refused}; a series
+// {label, values, u, tone, dashed}, u: standard uncertainties; a mark {t, text, alarm}; refused: times of windows.
 export class TimePlots {
   constructor(onRange) {
     this.onRange = onRange;
@@ -33,9 +33,9 @@ export class TimePlots {
 
   made(one, times, box) {
     const axis = axisOf(), series = [{}], data = [times], bands = [];
-    for (const { label, values, u, tone } of one.series) {
+    for (const { label, values, u, tone, dashed } of one.series) {
       const colour = named(`--${tone}`), at = series.length;
-      series.push({ label, stroke: colour, width: 2, points: { show: times.length < 60, size: 4 }, value: (_, v) => (v === null || v === undefined ? "–" : `${signed(v, one.digit)}${one.unit}`) });
+      series.push({ label, stroke: colour, width: 2, dash: dashed ? [5, 4] : undefined, points: { show: dashed || times.length < 60, size: 4 }, value: (_, v) => (v === null || v === undefined ? "–" : `${signed(v, one.digit)}${one.unit}`) });
       data.push(values);
       if (!u) continue;
       for (const k of [2, -2]) {
@@ -51,7 +51,7 @@ export class TimePlots {
       axes: [axis, { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => `${signed(v, 10 * (ticks[1] - ticks[0] || 1))}${one.unit}`) }],
       series, bands, padding: [12, 12, null, null],
       scales: { y: { range: (_, low, high) => rangeOf(one, low, high) } },
-      hooks: { draw: [(made) => drawMarks(made, one.marks ?? [])], setScale: [(made, key) => key === "x" && this.zoomed(made)] },
+      hooks: { draw: [(made) => drawMarks(made, one.marks ?? []), (made) => drawRefused(made, one.refused ?? [])], setScale: [(made, key) => key === "x" && this.zoomed(made)] },
     }, data, box);
     [...box.querySelectorAll(".u-series")].forEach((label, i) => { label.hidden = Boolean(series[i].edge); });
     return plot;
@@ -88,7 +88,8 @@ export class TimePlots {
 function rangeOf({ series, digit }, low, high) {
   const ends = [-2, 2].map((k) => series.flatMap(({ values, u }) => values.map((v, j) => v + k * (u?.[j] ?? 0)).filter(finite)).sort((a, b) => k * (a - b)));
   const [least, most] = ends.map((sorted) => sorted[Math.floor(0.9 * (sorted.length - 1))] ?? 0), all = series.flatMap(({ values }) => values.filter(finite)), reach = most - least;
-  return [Math.max(low, Math.min(least - reach, ...all)), Math.min(high, Math.max(most + reach, ...all))].map((end, i) => (i ? Math.max(end, digit) : Math.min(end, -digit)));
+  const [from, to] = [Math.max(low, Math.min(least - reach, ...all)), Math.min(high, Math.max(most + reach, ...all))], margin = 0.05 * (to - from);
+  return [Math.min(from - margin, -digit), Math.max(to + margin, digit)];
 }
 
 // Dashed lines with their words: where a drift or a step began, a reference was exchanged, the agent began anew.
@@ -111,6 +112,21 @@ function drawMarks(plot, marks) {
     ctx.fillText(text, x + (right ? -5 : 5) * devicePixelRatio, bbox.top + size * (1 + (i % 3)));
   });
   ctx.restore();
+}
+
+// A triangle at the lower edge for each window that is held.
+function drawRefused(plot, times) {
+  const { ctx, bbox } = plot, size = 4 * devicePixelRatio, low = bbox.top + bbox.height;
+  ctx.fillStyle = named("--bad");
+  for (const t of times) {
+    const x = plot.valToPos(t, "x", true);
+    if (x < bbox.left || x > bbox.left + bbox.width) continue;
+    ctx.beginPath();
+    ctx.moveTo(x - size, low);
+    ctx.lineTo(x + size, low);
+    ctx.lineTo(x, low - 2 * size);
+    ctx.fill();
+  }
 }
 
 // Curves {label, values, u} over one axis of x; `log`: a logarithmic axis of frequency; `time`: x is s of UTC.

@@ -3,10 +3,10 @@ import { $, clean, full, get, make, placeOf, table, text, view } from "./common.
 import { opener, poseForm } from "./commands.js";
 import { drawRows } from "./diagram.js";
 import { ago, AXES, band, day, finite, MAIN, moment, NAMES, plusMinus, rounded, short, symbol, two } from "./format.js";
-import { bars, chip } from "./parts.js";
+import { bars, chip, may } from "./parts.js";
 import { savePlots } from "./picture.js";
 import { boxOf, curves, TimePlots } from "./plots.js";
-import { certificate, explanation, shortName, steps, told as toldOf } from "./words.js";
+import { certificate, covered, explanation, NO_VERDICT, shortName, steps, timeOf, told as toldOf } from "./words.js";
 
 const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
 const KINDS = ["calibration", "window", "drift", "status", "estimate", "clock"];
@@ -47,12 +47,32 @@ function marksOf(row, trends, whole, statuses) {
   return marks.slice(0, MARKS_MAX);
 }
 
+// The newest estimates of a sensor that is held, after its calibration in force.
+function beyondOf(row, whole, estimates) {
+  return row?.status === "HELD" ? estimates.map((e) => e.calibration).filter((c) => c.t_utc_ns > (whole.at(-1)?.t_utc_ns ?? 0)) : [];
+}
+
+// A series until today: what is in force stays so, also while windows contradict it; nobody knows it of a silent sensor.
+function going({ values, u, ...rest }, more, stays) {
+  const last = (all) => Array(more).fill(stays ? all.at(-1) ?? null : null);
+  return { ...rest, values: [...values, ...last(values)], u: [...u, ...last(u)] };
+}
+
 function drawPlots(mine, row, trends, whole, found) {
-  const from = whole.find((c) => c.t_utc_ns >= (trends.accepted_utc_ns ?? 0)) ?? whole[0], times = whole.map((c) => c.t_utc_ns / 1e9), all = NAMES.map((_, i) => i);
-  const marks = marksOf(row, trends, whole, found.status);
-  const plot = (title, which, unit, digit, height) => ({ title, unit, digit, height, marks: height > 200 ? marks : [], series: which.map((i, k) => seriesOf(whole, from, i, AXES[which.length === 3 ? k : Math.floor(i / 3)])) });
+  const from = whole.find((c) => c.t_utc_ns >= (trends.accepted_utc_ns ?? 0)) ?? whole[0], all = NAMES.map((_, i) => i);
+  const beyond = beyondOf(row, whole, found.estimate), stays = row && !["silent", "no data"].includes(row.kind), today = row && row.kind !== "silent" ? [timeOf(row)] : [];
+  const times = [...whole, ...beyond].map((c) => c.t_utc_ns / 1e9).concat(whole.length ? today.map((ns) => ns / 1e9) : []), more = times.length - whole.length;
+  const held = row?.status === "HELD" ? trends.held_utc_ns : null, refused = held ? found.window.filter((w) => !w.used && w.t_utc_ns >= held).map((w) => w.t_utc_ns / 1e9) : [];
+  const marks = [...marksOf(row, trends, whole, found.status), ...(held ? [{ t: held / 1e9, text: "held", alarm: true }] : [])];
+  const before = Array(whole.length).fill(null), after = today.map(() => null), round = ({ label, values, u, ...rest }) => ({ ...rest, label: `${label} est.`, dashed: true, values: [...before, ...values, ...after], u: [...before, ...u, ...after] });
+  const plot = (title, which, unit, digit, height) => {
+    const of = (calibrations) => which.map((i, k) => seriesOf(calibrations, from, i, AXES[which.length === 3 ? k : Math.floor(i / 3)]));
+    return { title, unit, digit, height, marks: height > 200 ? marks : [], refused: height > 200 ? refused : [], series: [...of(whole).map((one) => going(one, more, stays)), ...(beyond.length && which.length === 3 ? of(beyond).map(round) : [])] };
+  };
   const transverse = all.filter((i) => i < 9 && !MAIN.includes(i));
+  mine.last = times.at(-1) ?? 0;
   $("main-title").replaceChildren("Main sensitivities, change since the ", text(trends.accepted ? "accepted" : "first"), " calibration of ", from ? day(from.t_utc_ns) : "");
+  $("beyond").textContent = `${beyond.length ? "Dashed: estimates, not in force. " : ""}${refused.length ? "▴ at the lower edge: windows that are held. " : ""}`;
   if (!mine.boxes) {
     mine.boxes = [boxOf(""), boxOf(""), boxOf("")];
     $("main-plot").replaceChildren(mine.boxes[0]);
@@ -79,9 +99,9 @@ function showMatrix(newest, row, trends) {
   if (!newest) { $("matrix").replaceChildren(make("p", "No calibration is in force.")); return; }
   const moved = new Set((row?.verdicts ?? []).map((v) => v.parameter));
   const cell = (i) => {
-    const U = 2 * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "";
+    const U = 2 * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "", silent = over && Math.abs(change.change) > change.U && !moved.has(NAMES[i]);
     const known = newest.determined[i] ? [] : [make("small", "by the prior")];
-    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(over ? [make("small", `moved ${over}`)] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
+    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(over ? [make("small", `moved ${over}${silent ? ", no verdict" : ""}`, silent ? { title: NO_VERDICT } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
   };
   const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
   const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);
@@ -112,7 +132,7 @@ function showDevice(row, newest, clocks, trends) {
     newest && ["Sensor", newest.identity], clock && ["Rate", `${short(clock.rate_hz)} Hz, clock ${two(ppm)} ppm`], clock && finite(clock.lag_s) && ["Lag", `${plusMinus(1000 * clock.lag_s, 2000 * clock.u_lag_s)} ms`],
     newest && finite(newest.temperature_low_degc) && ["Temperature", `${two(newest.temperature_low_degc)} to ${two(newest.temperature_high_degc)} °C calibrated, S and Q at ${short(newest.reference_temperature_degc)} °C`],
     newest && ["Reference", row?.reference ? shortName(row.reference) : "none"], ...certified(row, trends),
-    row && ["Last good window", `${ago(row.last_good_utc_ns)} ago`], newest && ["Result", newest.signed_by ? `signed with the key ${newest.signed_by}` : "not verified"],
+    row && ["Last good window", `${ago(row.last_good_utc_ns, timeOf(row))} ago`], newest && ["Result", newest.signed_by ? `signed with the key ${newest.signed_by}` : "not verified"],
   ].filter(Boolean);
   $("device").replaceChildren(make("dl", lines.flatMap(([title, told]) => [make("dt", title), make("dd", told)]), { class: "facts" }));
 }
@@ -214,6 +234,7 @@ function showHead(row, place, trends) {
   $("name").replaceChildren(text(name), ...(row ? [text(" "), chip(row.kind)] : []));
   const { say, more } = row ? toldOf(row, trends) : { say: "The monitor has no results of this sensor.", more: [] };
   $("state").replaceChildren(make("span", say));
+  $("usable").replaceChildren(...(row ? [may(covered(row, trends))] : []));
   $("beside-state").replaceChildren(make("span", more));
   $("sensor-steps").replaceChildren(...(row ? steps(row, trends) : []), ...(row && row.kind === "sound" ? [make("p", "Nothing: it is in order.")] : []));
 }
@@ -241,7 +262,6 @@ export async function show(told, go) {
     const name = row ? full(row) : "", [told2, whole, hours, ...results] = await Promise.all([get(`api/trends?${new URLSearchParams({ of: name })}`), get(`api/spread?${place}`), get(`api/hours?${place}&limit=${NEWEST}`), ...KINDS.map((what) => get(`api/history?${place}&what=${what}&limit=${NEWEST}`))]);
     if (current !== mine) return;
     const trends = told2[name] ?? {}, found = Object.fromEntries(KINDS.map((what, i) => [what, results[i]])), later = [], newest = found.calibration.at(-1);
-    mine.last = (whole.at(-1)?.t_utc_ns ?? 0) / 1e9;
     showHead(row, place, trends);
     drawPlots(mine, row, trends, whole, found);
     if (whole.length) drawResponse(newest);

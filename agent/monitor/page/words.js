@@ -1,7 +1,7 @@
 // What is said of a sensor: its verdicts in sentences, what else is steady, and what a person can do.
 import { commandLine } from "./commands.js";
 import { make } from "./common.js";
-import { ago, AXES, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
+import { ago, AXES, band, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
 import { copier, spark } from "./parts.js";
 
 const LEAST_PCT = 0.2; // half the range of a small plot at least, so that noise is not made large
@@ -15,19 +15,46 @@ function scaled(parameter, scale) {
   return { unit: !known ? "" : offset ? " m/s²" : " %", factor: !known ? 1 : (offset ? 1 : 100) / Math.abs(scale) };
 }
 
+const named = (parameter) => [parameter[0] === "Q" ? "Offset " : "Sensitivity ", symbol(parameter)];
 const pair = (v, U, unit) => [make("b", `${rounded(Math.abs(v), U)}${unit}`), finite(U) ? ` (± ${two(U)}${unit})` : ""];
 const spread = (days) => (finite(days) ? ` (± ${duration(2 * days * DAY_NS)})` : "");
 
-// One verdict in a sentence, by the history where it shows the change, else by the verdict itself, with its date.
+// One verdict in a sentence, by the history where it shows the change, else by the verdict itself, with its date. Where U
+// is larger than the size, the change is sure all the same (by the verdict), but not its size.
 export function sentence(verdict, trend) {
-  const change = trend?.change, { unit, factor } = scaled(verdict.parameter, trend?.scale), name = symbol(verdict.parameter);
+  const change = trend?.change, { unit, factor } = scaled(verdict.parameter, trend?.scale), name = named(verdict.parameter);
   const of = change ?? { size: verdict.change, u_size: verdict.u_change, rate: verdict.rate, u_rate: verdict.u_rate, onset_utc_ns: verdict.onset_utc_ns };
   const size = pair(of.size * factor, 2 * of.u_size * factor, unit), since = [day(of.onset_utc_ns), spread(of.u_onset_days)];
-  const told = change ? "." : ["; told on ", day(verdict.t_utc_ns), "."];
-  if ((change?.shape ?? verdict.verdict) === "stepped") return [name, of.size < 0 ? " fell by " : " rose by ", ...size, " at once, on ", ...since, told].flat();
+  const told = change ? "." : ["; told on ", day(verdict.t_utc_ns), "."], sized = !(2 * of.u_size > Math.abs(of.size));
+  const down = of.size < 0, unsure = ["It is sure that it does, but not by how much: ", ...size];
+  if ((change?.shape ?? verdict.verdict) === "stepped") {
+    const fell = [...name, down ? " fell" : " rose"];
+    return (sized ? [...fell, " by ", ...size, " at once, on ", ...since, told] : [...fell, " at once, on ", ...since, ". ", ...unsure, told]).flat();
+  }
   const days = Math.abs(of.rate * factor * MONTH_DAYS) < 0.1 ? [YEAR_DAYS, "year"] : [MONTH_DAYS, "month"];
-  const rate = pair(of.rate * factor * days[0], 2 * of.u_rate * factor * days[0], unit);
-  return [name, of.rate < 0 ? " falls by " : " rises by ", ...rate, ` a ${days[1]}, `, ...size, " since ", ...since, told].flat();
+  const rate = [...pair(of.rate * factor * days[0], 2 * of.u_rate * factor * days[0], unit), ` a ${days[1]}`], falls = [...name, down ? " falls" : " rises"];
+  return (sized ? [...falls, " by ", ...rate, ", ", ...size, " since ", ...since, told] : [...falls, " since ", ...since, ". ", ...unsure, " so far, ", ...rate, told]).flat();
+}
+
+// Whether the values that a sensor measures, corrected with S and Q in force, may be used: [tone, sentence]. By status,
+// verdicts and hearing alone; U is that of the calibration in force, and holds while windows fit it.
+export function covered(row, trends) {
+  const U = finite(row.u_pct) ? [`U = ± ${two(row.u_pct)} %`, row.band_hz?.length === 2 ? ` at ${band(row.band_hz)}` : ""] : ["U is not known"];
+  const good = row.last_good_utc_ns, held = trends?.held_utc_ns ?? row.status_utc_ns, last = good && (row.status !== "HELD" || good < held) ? good : held;
+  const until = good ? ["Values until the last window that fitted (", day(last), ") may be used: ", ...U, ". "] : [];
+  if (row.kind === "uncalibrated" || !row.calibration_utc_ns) return ["off", [make("b", "Values may not be used yet"), ": no calibration is in force."]];
+  if (row.kind === "doubled") return ["bad", [make("b", "Values may not be used"), ": two gateways have this name, and nobody knows whose calibration is shown."]];
+  if (row.kind === "silent") return ["off", [...until, make("b", "Of later values nobody knows"), "."]];
+  if (row.kind === "no data") return ["bad", [...until, make("b", "Later values may not be used"), ": no window has confirmed them."]];
+  if (row.status === "HELD") {
+    const hold = ON_HOLD.test(row.reason);
+    return [hold ? "warn" : "bad", [make("b", ["Values since ", day(last), hold ? " are not checked" : " may not be used"]), hold ? ": an operator put the calibration on hold. " : ": windows contradict S and Q in force, and U does not cover it. ", ...(good ? ["Earlier ones may: ", ...U, "."] : [])]];
+  }
+  const changes = row.verdicts.map((v) => [trends?.found?.[v.parameter]?.change?.onset_utc_ns ?? v.onset_utc_ns, v.t_utc_ns]), from = Math.min(...changes.map(([onset]) => onset)), told = Math.max(...changes.map(([, at]) => at)), followed = Math.max(told, trends?.adopted_utc_ns ?? 0);
+  if (changes.length && row.calibration_utc_ns < told) return ["bad", [make("b", ["Values since ", day(from), " may not be used"]), ": S and Q in force are of ", day(row.calibration_utc_ns), " and do not follow the change. Earlier ones may: ", ...U, "."]];
+  const old = timeOf(row) - row.calibration_utc_ns > DAY_NS ? [" (of ", day(row.calibration_utc_ns), ")"] : [];
+  const late = changes.length ? ["; S and Q follow the change. Values of ", day(from), " to ", day(followed), ", before they did, may be wrong by it"] : [];
+  return ["ok", [make("b", "Values of today may be used"), ": ", ...U, ...old, ...late, "."]];
 }
 
 function often(verdict) {
@@ -49,9 +76,9 @@ function cause(beside) {
   return beside.changed * 2 >= beside.count ? `Only ${others}: look at the reference first.` : `${others}: rather this sensor than its reference.`;
 }
 
-// The time of a sensor's gateway: that of its newest result while it catches up, as a simulated one may.
+// The present of a sensor: the time that its gateway has reached while it catches up, as a simulated one may.
 const catchesUp = (state) => state === "catching up";
-export const timeOf = (row) => (catchesUp(row.gateway_state) ? row.result_utc_ns : now());
+export const timeOf = (row) => (catchesUp(row.gateway_state) && row.gateway_utc_ns) || now();
 // The state of a gateway in words.
 export const stateOf = (gateway) => (catchesUp(gateway.state) ? `catching up, now at ${day(gateway.told_utc_ns).textContent}` : gateway.state || "on the bus");
 
@@ -74,23 +101,44 @@ export function explanation(reason) {
 
 const inWords = ({ best, alike, fits, least, none }) => (!best ? "No known explanation fits them better." : `${fits ? "Explained best by" : "Nearest, but not within what chance allows:"} another ${[best, ...alike].join(", or another ")}: chi-squared ${least} in place of ${none}.`);
 
+const ON_HOLD = /^put on hold by/;
+
 // {say, more} of a sensor that is held, perhaps with a step.
 function heldWords(row, verdicts, trends) {
-  const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason), kept = trends?.accepted_utc_ns ? [" The calibration before stays in force."] : [];
+  const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason);
   const reason = why ? [`${why.held} windows ${why.agree ? "agree with what the calibration may have become." : "contradict the calibration."}`] : [row.reason, "."];
-  return { say: [...since, ...(verdicts.length ? verdicts.flatMap((v) => [...v, " "]) : reason)], more: [...(why ? [inWords(why)] : verdicts.length ? reason : []), ...kept] };
+  return { say: [...since, ...(verdicts.length ? verdicts.flatMap((v) => [...v, " "]) : reason)], more: why ? [inWords(why)] : verdicts.length ? reason : [] };
 }
 
-// {say, more} of a sensor that is not in order.
+// What is said of a sensor that is in order: its largest change of a main sensitivity, and what was adopted.
+function soundWords(row, trends) {
+  const most = largest(trends), adopted = trends?.adopted_utc_ns ? [" A jump was adopted on ", day(trends.adopted_utc_ns), "; U has been larger since."] : [];
+  const change = most ? [` Its largest change since ${trends.accepted ? "the accepted" : "the first"} calibration is that of `, symbol(most.name), `: ${signed(most.pct, most.U)} % (± ${two(most.U)} %)`, most.over > 1 ? `, ${NO_VERDICT}.` : "."] : [];
+  return { say: ["No drift and no step is found.", ...adopted], more: [...change, trends?.beside?.count ? ` ${trends.beside.count} other sensors have the same reference.` : ""] };
+}
+
+// Why a change above its U is no verdict.
+export const NO_VERDICT = "no more than the agent's test lets a sound sensor walk in this time";
+
+// The main sensitivity that has changed most over U of its change: {name, pct, U (both in %), over}.
+export function largest(trends) {
+  const all = MAIN.map((i, k) => ({ ...trends?.changes?.[i], name: NAMES[i], pct: trends?.main_pct?.[k].at(-1) })).filter((c) => finite(c.change) && c.U > 0);
+  const most = all.map((c) => ({ name: c.name, pct: c.pct, over: Math.abs(c.change) / c.U, U: Math.abs((c.pct * c.U) / c.change) })).sort((a, b) => b.over - a.over)[0];
+  return most && { ...most, U: most.U > 0 && finite(most.U) ? most.U : 0.01 };
+}
+
+// {say, more} of a sensor.
 export function told(row, trends) {
   const verdicts = row.verdicts.map((v) => sentence(v, trends?.found?.[v.parameter]));
   const reason = row.reason ? [row.reason, "."] : [], since = trends?.held_utc_ns ?? row.status_utc_ns;
-  if (row.kind === "silent") return { say: ["Not heard since ", make("b", moment(row.heard_utc_ns)), ` (${duration(now() - row.heard_utc_ns)}). Its calibration was ${row.status || "not known"} then; nobody knows now.`], more: verdicts.flatMap((v) => ["Before: ", ...v, " "]) };
+  const newest = row.heard_utc_ns - row.result_utc_ns > DAY_NS ? ["; its newest result is of ", day(row.result_utc_ns)] : [];
+  if (row.kind === "silent") return { say: ["Not heard since ", make("b", moment(row.heard_utc_ns)), ` (${duration(now() - row.heard_utc_ns)})`, ...newest, "."], more: verdicts.flatMap((v) => ["Before: ", ...v, " "]) };
+  if (row.kind === "doubled") return { say: ["Two gateways have this name, and their results are mixed."], more: verdicts.flatMap((v) => ["One of them: ", ...v, " "]) };
   if (row.kind === "held") return heldWords(row, verdicts, trends);
   if (verdicts.length) return { say: verdicts.flatMap((v) => [...v, " "]), more: [often(row.verdicts[0]), " ", ...steady(row), cause(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
-  if (row.kind === "no data") return { say: ["No data since ", make("b", moment(since)), ": ", ...reason], more: ["What is in force was right then."] };
+  if (row.kind === "no data") return { say: ["No data since ", make("b", moment(since)), ": ", ...reason], more: [] };
   if (row.kind === "uncalibrated") return { say: [row.status === "COLLECTING" ? "Windows are being collected: " : "No calibration is in force: ", ...reason], more: [] };
-  return { say: ["No drift and no step is found", row.last_good_utc_ns ? [". The last good window is of ", moment(row.last_good_utc_ns)] : "", "."].flat(), more: trends?.beside?.count ? [`${trends.beside.count} other sensors have the same reference.`] : [] };
+  return soundWords(row, trends);
 }
 
 const BELOW = " by the command below";
@@ -101,6 +149,8 @@ function advice(reason) {
   return told || "Look at the mount. If it is loose, fasten it: windows that fit again end HELD.";
 }
 
+export const ofDoubled = () => [make("p", "Find the copy (its log says it too), stop it, and give it another name, data directory and key:"), copier("sudo systemctl stop fieldcal")];
+
 // What a person can do: elements with a command to copy.
 export function steps(row, trends) {
   const gateway = `${row.site}/${row.gateway}`, order = (verb, given) => commandLine({ gateway, sensor: row.sensor, verb, arguments: given }, "--connect ENDPOINT");
@@ -108,27 +158,39 @@ export function steps(row, trends) {
   const told = row.kind === "held" ? advice(row.reason) : "", asked = told.includes(BELOW) ? [] : [make("p", `If the sensor has really changed, accept estimate ${row.estimate}:`)];
   const accept = waits ? [...asked, copier(order("accept", { sequence: row.estimate }))] : [];
   if (row.kind === "silent") return [make("p", "Look at power and network, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
+  if (row.kind === "changed") return [make("p", "Find out what happened to it: mount, cable, temperature, reference. Compare it with another reference."), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`)];
   if (row.kind === "drifting") return [make("p", "Compare it with another reference. If that agrees, accept what it shows."), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`), ...accept];
-  if (row.kind === "held" && /^put on hold by/.test(row.reason)) return [make("p", "An operator put it on hold. To use windows again:"), copier(order("hold", { release: true }))];
+  if (row.kind === "held" && ON_HOLD.test(row.reason)) return [make("p", "An operator put it on hold. To use windows again:"), copier(order("hold", { release: true }))];
   if (row.kind === "held") return [make("p", told), ...(accept.length ? accept : [copier("fieldcal show --data-dir /var/lib/fieldcal")])];
+  if (row.kind === "doubled") return ofDoubled();
   if (row.kind === "no data") return [make("p", "Check power and cables of the sensor, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "uncalibrated") return [make("p", "Turn the sensor to the position that the log names:"), copier("journalctl -fu fieldcal -o cat")];
   return [];
 }
 
-// A year of the parameter that a card is of, with its U and the begin of its change.
+// The year of a card until today: of the parameter that it is of, with its U and the begin of its change, or of the three
+// main sensitivities. What is in force stays so; what is not, the newest estimates of a sensor that is held, is dashed.
 export function cardPlot(row, trends) {
-  const verdict = row.verdicts[0], trend = verdict && trends?.found?.[verdict.parameter];
-  if (!trend?.t_utc_ns.length) return trends?.t_utc_ns?.length ? [small(trends.t_utc_ns, trends.main_pct.map((v, i) => ({ v, tone: AXES[i] })), " %", "Sxx, Syy, Szz", [])] : [];
-  const { unit, factor } = scaled(verdict.parameter, trend.scale), first = trend.values[0];
-  const v = trend.values.map((each) => (each - first) * factor), u = trend.u.map((each) => 2 * each * factor);
-  return [small(trend.t_utc_ns, [{ v, u, tone: toneOf(verdict.parameter) }], unit, verdict.parameter, [trend.change?.onset_utc_ns ?? verdict.onset_utc_ns])];
+  if (!trends?.t_utc_ns?.length) return [];
+  const verdict = row.verdicts[0], trend = verdict && trends.found?.[verdict.parameter], beyond = trends.estimates ?? [], later = beyond.map((e) => e.t_utc_ns);
+  const marks = trends.refused_utc_ns ? [trends.held_utc_ns] : [], to = row.kind === "silent" ? trends.t_utc_ns.at(-1) : timeOf(row), stays = row.kind !== "silent" && row.kind !== "no data";
+  const more = { marks, to, refused: trends.refused_utc_ns ?? [], dashed: later.length > 0 };
+  if (!trend?.t_utc_ns.length) return [small(trends.main_pct.flatMap((v, i) => [going(trends.t_utc_ns, v, null, AXES[i], stays && to), ...estimated(later, beyond.map((e) => e.main_pct[i]), null, AXES[i])]), " %", "Sxx, Syy, Szz", more)];
+  const { unit, factor } = scaled(verdict.parameter, trend.scale), first = trend.values[0], k = NAMES.indexOf(verdict.parameter), tone = toneOf(verdict.parameter);
+  const part = (v) => (finite(v) ? (v - first) * factor : null), u = (v) => 2 * v * factor, onset = trend.change?.onset_utc_ns ?? verdict.onset_utc_ns;
+  const curves = [going(trend.t_utc_ns, trend.values.map(part), trend.u.map(u), tone, stays && to), ...estimated(later, beyond.map((e) => part(e.values[k])), beyond.map((e) => u(e.u[k])), tone)];
+  return [small(curves, unit, verdict.parameter, { ...more, marks: marks.length ? marks : [onset] })];
 }
 
-function small(t, curves, unit, name, marks) {
-  const all = curves.flatMap(({ v, u }) => v.flatMap((each, k) => [each - (u?.[k] ?? 0), each + (u?.[k] ?? 0)])).filter(finite);
+// A curve that goes on as it ends until `to`, where it does.
+const going = (t, v, u, tone, to) => (to ? { t: [...t, to], v: [...v, v.at(-1)], u: u && [...u, u.at(-1)], tone } : { t, v, u, tone });
+const estimated = (t, v, u, tone) => (t.length ? [{ t, v, u, tone, dashed: true }] : []);
+
+function small(curves, unit, name, { marks, to, refused, dashed }) {
+  const all = curves.flatMap(({ v, u }) => v.flatMap((each, k) => [each - (u?.[k] ?? 0), each + (u?.[k] ?? 0)])).filter(finite), from = curves[0].t[0];
   const least = unit === " %" ? LEAST_PCT : 0, low = Math.min(-least, ...all), high = Math.max(least, ...all), label = `${name}: ${signed(low, 0.1 * (high - low))} to ${signed(high, 0.1 * (high - low))}${unit}`;
-  return make("figure", [spark(`${label}, from ${utcDay(t[0])} to ${utcDay(t.at(-1))}`, curves.map((curve) => ({ t, ...curve })), [t[0], t.at(-1), low, high], marks, 46),
-    make("figcaption", [make("span", label, { class: "of" }), day(t[0]), day(t.at(-1))])]);
+  const words = [label, dashed ? "dashed: estimates, not in force" : "", refused.length ? "▴ windows held" : ""].filter(Boolean).join("; ");
+  return make("figure", [spark(`${words}, from ${utcDay(from)} to ${utcDay(to)}`, curves, [from, to, low, high], marks, 46, refused),
+    make("figcaption", [make("span", words, { class: "of" }), day(from), day(to)])]);
 }
 const utcDay = (ns) => day(ns).textContent;

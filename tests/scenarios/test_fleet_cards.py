@@ -1,0 +1,142 @@
+"""What the page says of a sensor, for each kind of it, and that nothing moves under the eyes of who reads."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from agent.core.events import Result
+from agent.delivery.keys import Address
+from agent.delivery.received import Received
+from tests.unit.browser import Watched, chromium, needs_chromium
+from tests.unit.results import calibration, status
+from tests.unit.zenoh_site import Site
+
+pytest.importorskip("starlette", reason="the extra monitor is not installed")
+pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+from tests.unit.monitor_site import Served
+
+pytestmark = needs_chromium
+SHIFTS = """
+window.moved = 0;
+new PerformanceObserver((l) => l.getEntries().forEach((e) => { if (!e.hadRecentInput) moved += e.value; }))
+  .observe({ type: 'layout-shift', buffered: true });
+"""
+# Of each invented sensor of parts.html: its chip, whether values may be used, and a part of what is said of it.
+SAID = [
+    ("drifting", r"Values of today may be used: U = ± 0.42 % at 1.0 – 18 Hz; S and Q follow the change\. Values of "
+     r".+ to .+, before they did, may be wrong by it\.", r"Sxx rises by .+ a month, 2.40 % \(± 0.50 %\) since"),
+    ("drifting", "Values of today may be used: U = ± 3.7 %", r"since .+\. It is sure that it does, but not by how much"
+     r": 2.4 % \(± 3.7 %\) so far"),
+    ("changed", r"Values of today may be used: .+S and Q follow the change", r"fell by 3.10 % \(± 0.20 %\) at once"),
+    ("held", r"Values since .+ may not be used: windows contradict S and Q in force.+Earlier ones may: U = ± 0.42 %",
+     r"Held since .+: Sensitivity Syy fell by 9.00 %"),
+    ("held", "Values since .+ may not be used: windows contradict", "Held since .+: the window contradicts"),
+    ("held", "Values since .+ are not checked: an operator put the calibration on hold", "put on hold by anna"),
+    ("two of one name", "Values may not be used: two gateways have this name", "their results are mixed"),
+    ("no data", "Values until the last window that fitted .+ may be used: .+Later values may not be used",
+     "No data since"),
+    ("not heard", "Values until the last window that fitted .+ may be used: .+Of later values nobody knows",
+     "Not heard since .+; its newest result is of"),
+    ("not calibrated", "Values may not be used yet: no calibration is in force", "Windows are being collected"),
+]  # fmt: skip
+# What changes a row of parts.html, and whether its values may be used then.
+CHANGED = [
+    ({}, "Values of today may be used: U = ± 0.42 % at 1.0 – 18 Hz."),
+    ({"u_pct": None, "band_hz": []}, "Values of today may be used: U is not known."),
+    ({"calibration_utc_ns": -3}, "Values of today may be used: U = ± 0.42 % at 1.0 – 18 Hz (of "),
+    # The policy `propose` publishes verdicts, and S and Q in force wait for an operator.
+    ({"kind": "drifting", "verdicts": [-9, -2], "calibration_utc_ns": -3}, "may not be used: S and Q in force are of "),
+    (
+        {"kind": "drifting", "verdicts": [-9, -2], "status": "HELD", "status_utc_ns": -1},
+        "may not be used: windows contr",
+    ),
+    ({"kind": "silent", "status": "HELD", "last_good_utc_ns": None}, "Of later values nobody knows."),
+    ({"calibration_utc_ns": None}, "Values may not be used yet"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as opened:
+        yield opened
+
+
+def test_each_kind_of_sensor_says_what_it_is_and_whether_its_values_may_be_used(
+    site: Site, tmp_path: Path, browser: Any
+) -> None:
+    with Served(site, tmp_path / "monitor") as served:
+        watched = Watched(browser, served.address, viewport={"width": 1440, "height": 900})
+        page = watched.open("parts.html")
+        page.locator("#numbers table").wait_for()
+        cards = page.locator("#cards .card").evaluate_all(
+            "all => all.map((c) => ['.chip', '.may', '.say'].map((part) => c.querySelector(part).textContent))"
+        )
+        assert [kind for kind, _, _ in cards] == [kind for kind, _, _ in SAID]
+        for (_, usable, say), (kind, wanted, part) in zip(cards, SAID, strict=True):
+            assert re.match(wanted, usable), (kind, usable)
+            assert re.search(part, say), (kind, say)
+        assert "no more than the agent's test lets a sound sensor walk" in page.locator("#sound .more").inner_text()
+        # The history goes on to today: the newest estimates dashed, and the windows that are held.
+        held = page.locator("#cards .card").nth(3)
+        assert (held.locator(".curve.dashed").count(), held.locator(".refused").count()) == (1, 11)
+        for curve in page.locator("#cards .card .curve.y").evaluate_all(
+            "all => all.map((c) => c.getAttribute('points'))"
+        ):
+            assert float(curve.split()[-1].split(",")[0]) in (100.0, pytest.approx(80, abs=3))  # not of what is lost
+        cut = "all => all.filter((c) => c.scrollWidth > c.clientWidth).length"
+        assert page.locator(".command code").evaluate_all(cut) == 0
+        for change, wanted in CHANGED:
+            said = page.evaluate(
+                """async (change) => {
+                    const { covered } = await import('./words.js'), { make } = await import('./common.js'), ns = 1e6 * Date.now(), day = 86400e9;
+                    const at = (v) => (typeof v === 'number' && v < 0 ? ns + v * day : v), of = Object.entries(change).map(([k, v]) => [k, at(v)]);
+                    const row = { kind: 'sound', status: 'VALID', status_utc_ns: ns, reason: '', verdicts: [], u_pct: 0.42, band_hz: [1, 18], calibration_utc_ns: ns, last_good_utc_ns: ns, ...Object.fromEntries(of) };
+                    if (row.verdicts.length) row.verdicts = [{ parameter: 'Sxx', onset_utc_ns: at(row.verdicts[0]), t_utc_ns: at(row.verdicts[1]) }];
+                    return make('p', covered(row, {})[1]).textContent;
+                }""",  # noqa: E501
+                change,
+            )
+            assert wanted in said, (change, said)
+        watched.close()
+
+
+def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
+    site: Site, tmp_path: Path, browser: Any
+) -> None:
+    with Served(site, tmp_path / "monitor") as served:
+        number = 0
+
+        def take(sensor: str, result: Result) -> None:
+            nonlocal number
+            number += 1
+            fields = msgspec.json.decode(msgspec.json.encode(result)) | {"sensor": sensor, "sequence": number}
+            served.database.add([Received("", Address("site", "gw", sensor, result.what), number, fields, None)])
+            served.fleet.take("site", "gw", sensor, result.what, fields)
+
+        served.fleet.set_alive("site", "gw", True)
+        for k in range(12):
+            take(f"s{k:02}", calibration(1))
+            take(f"s{k:02}", status(1, "HELD" if k in (4, 8) else "VALID"))
+        watched = Watched(browser, served.address, viewport={"width": 1440, "height": 900})
+        watched.context.add_init_script(SHIFTS)
+        page = watched.open()
+        names, asked = page.locator("#cards h3 a"), page.locator("#new-cards")
+        page.locator("#cards svg").nth(1).wait_for()
+        take("s02", status(2, "HELD"))
+        take("s08", status(2, "VALID"))
+        asked.filter(has_text="1 new, 1 over: show").wait_for()
+        page.get_by_text("Needs a person: 2").wait_for()
+        assert names.all_inner_texts() == ["gw / s04", "gw / s08"]
+        assert page.locator("#cards .chip").all_inner_texts() == ["held", "over"]
+        assert page.evaluate("() => moved") == 0
+        asked.click()
+        assert names.all_inner_texts() == ["gw / s02", "gw / s04"]
+        asked.wait_for(state="hidden")
+        assert page.evaluate("() => moved") == 0  # what moves by a person's own click is not counted
+        watched.close()
