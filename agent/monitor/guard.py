@@ -21,6 +21,7 @@ HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
+    "X-Accel-Buffering": "no",  # nginx would keep changes back until they fill its buffer
 }
 READING = ("GET", "HEAD")
 LOG_S = 60.0  # s between two lines of the log about answers that failed

@@ -1,4 +1,4 @@
-"""What the page says of a sensor, for each kind of it, and that nothing moves under the eyes of who reads."""
+"""What the page says of a sensor, for each kind of it; that nothing moves under the eyes of who reads; many tabs."""
 
 from __future__ import annotations
 
@@ -45,6 +45,13 @@ SAID = [
      "Not heard since .+; its newest result is of"),
     ("not calibrated", "Values may not be used yet: no calibration is in force", "Windows are being collected"),
 ]  # fmt: skip
+NO_CLIPBOARD = "Object.defineProperty(Navigator.prototype, 'clipboard', { get: () => undefined });"  # as over http
+HIDE = """() => {
+    Object.defineProperty(document, 'hidden', { value: true, configurable: true });
+    document.dispatchEvent(new Event('visibilitychange'));
+}"""
+SHOW = "() => { delete document.hidden; document.dispatchEvent(new Event('visibilitychange')); }"
+TABS = 8  # a browser has six connections to one server
 # What changes a row of parts.html, and whether its values may be used then.
 CHANGED = [
     ({}, "Values of today may be used: U = ± 0.42 % at 1.0 – 18 Hz."),
@@ -139,4 +146,33 @@ def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
         assert names.all_inner_texts() == ["gw / s02", "gw / s04"]
         asked.wait_for(state="hidden")
         assert page.evaluate("() => moved") == 0  # what moves by a person's own click is not counted
+        watched.close()
+
+
+def test_more_tabs_than_a_browser_has_connections_and_a_copied_line_without_https(
+    site: Site, tmp_path: Path, browser: Any
+) -> None:
+    with Served(site, tmp_path / "monitor") as served:
+        watched = Watched(browser, served.address)
+        watched.context.add_init_script(NO_CLIPBOARD)
+        first = watched.open()
+        pages = [first, *(watched.context.new_page() for _ in range(TABS - 1))]
+        for page in pages:
+            page.goto(f"http://{served.address}/")
+            page.get_by_text("Sensors: 0").wait_for(timeout=5000)
+            if page is not pages[-1]:
+                page.evaluate(HIDE)
+        served.fleet.set_alive("site", "gw", True)
+        for number, result in enumerate((calibration(1), status(2, "HELD")), start=1):
+            fields = msgspec.json.decode(msgspec.json.encode(result)) | {"sequence": number}
+            served.fleet.take("site", "gw", "mems", result.what, fields)
+        pages[-1].get_by_text("Sensors: 1").wait_for()
+        assert first.get_by_text("Sensors: 0").count() == 1  # nobody sees it
+        first.evaluate(SHOW)
+        first.get_by_text("Sensors: 1").wait_for()
+        first.get_by_text("Held since").wait_for()  # who comes back sees the cards of now
+        first.locator("#cards button").click()
+        first.locator("#cards [role=status]").filter(has_text="cop").wait_for()
+        line = first.locator("#cards code").inner_text()
+        assert first.evaluate("() => getSelection().toString()") == line
         watched.close()

@@ -262,9 +262,11 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
         assert time.monotonic() - begun < SILENT_S
         history = monitor.get(asked)
         monitor.stop()
-        page.get_by_text("the monitor does not answer").wait_for()
+        page.get_by_text("the monitor does not answer since").wait_for()
+        page.locator("main.old").wait_for()  # what is shown is old, and looks so
         monitor = Monitor(site.endpoint, tmp_path / "monitor", address=monitor.address)
         page.get_by_text("Sensors: 1; 1 not in order").wait_for()  # the open page goes on by itself
+        page.locator("main:not(.old)").wait_for()
         assert monitor.get(asked) == history
         watched.close()
     finally:

@@ -1,5 +1,6 @@
 // Commands to one sensor: a dialog shows the command line, and forwards a signed line for users with the right.
 import { $, make, text } from "./common.js";
+import { copy } from "./parts.js";
 
 const WHAT = {
   accept: "The estimate comes into force.",
@@ -41,26 +42,17 @@ function pasting(order, told) {
 // Opens the dialog for an order {gateway, sensor, verb, arguments}.
 export function open(order) {
   const may = me.verbs.includes(order.verb), line = commandLine(order, may ? "--valid 300 --print" : "--connect ENDPOINT");
-  const told = make("p", [], { role: "status", id: "told" });
+  const told = make("p", [], { role: "status", id: "told" }), code = make("code", line);
   const hint = !me.user ? "Run this line on a machine with your key. Users who log in can also send a signed line from here:"
     : may ? "Run this line on a machine with your key; the signature is valid for 5 minutes:"
       : `${me.user} has no right to send ${order.verb} from here. With a key of your own, run:`;
   $("order").replaceChildren(
     make("h2", `${order.arguments.release ? "release" : order.verb}: ${order.sensor} of ${order.gateway}`, { id: "order-title" }),
-    make("p", WHAT[order.arguments.release ? "release" : order.verb]), make("p", hint), make("p", make("code", line)),
-    make("p", make("button", "Copy", { type: "button", click: () => copy(line, told) })),
+    make("p", WHAT[order.arguments.release ? "release" : order.verb]), make("p", hint), make("p", code),
+    make("p", make("button", "Copy", { type: "button", click: () => copy(line, code, told) })),
     ...(may ? pasting(order, told) : []), told,
     make("p", make("button", "Close", { type: "button", click: () => $("order").close() })));
   $("order").showModal();
-}
-
-async function copy(line, told) {
-  try {
-    await navigator.clipboard.writeText(line);
-    told.replaceChildren(text("copied"));
-  } catch {
-    told.replaceChildren(text("this browser does not copy; select the line"));
-  }
 }
 
 export const opener = (title, order) => make("button", title, { type: "button", click: () => open(order) });

@@ -68,7 +68,7 @@ function drawn({ row, rows, gateway, kind }) {
 }
 
 // A card that comes, goes or moves would push what a person reads. So it is told beside the heading, and comes when it is
-// asked for, or where nobody looks.
+// asked for, when a person comes back to the page, or where nobody touches it.
 const nobodyLooks = () => document.hidden || performance.now() - touchedAt > LET_GO_MS;
 
 function showCards(sensors, gateways, filter) {
@@ -276,6 +276,7 @@ export function start() {
   $("filters").addEventListener("submit", (event) => event.preventDefault());
   $("fleet-png").addEventListener("click", picture);
   $("more-cards").addEventListener("click", () => { shownCards += 20; show(latest, changing); });
+  document.addEventListener("visibilitychange", leave);
   $("new-cards").addEventListener("click", () => { order = null; show(latest, changing); });
   for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchmove"]) addEventListener(name, () => { touchedAt = performance.now(); }, { passive: true });
   $("fold").addEventListener("click", () => {

@@ -16,7 +16,7 @@ import * as sensor from "./sensor.js";
 // changes the parameters of the address.
 const VIEWS = { fleet, sensor, plan, live, bench, events };
 const OLD_S = 120; // from which the age of the last result is told
-let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, loading = false, again = false;
+let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, following = false, loading = false, again = false, lost = "";
 
 function go(given) {
   const next = view();
@@ -59,8 +59,14 @@ const say = (words) => { if ($("summary").textContent !== words) $("summary").re
 
 function failed(error) {
   if (error instanceof NeedsLogin) return logIn();
-  say("the monitor does not answer");
-  return undefined;
+  return silent();
+}
+
+// What is shown then is old, and looks so.
+function silent() {
+  lost ||= new Date().toLocaleTimeString();
+  say(`the monitor does not answer since ${lost}${told ? "; what is shown is of then" : ""}`);
+  document.querySelector("main").classList.toggle("old", Boolean(told));
 }
 
 // The rows that have changed, put into those that are known; all of them after a new begin.
@@ -79,6 +85,8 @@ async function load() {
   loading = true;
   try {
     told = joined(await get(`api/fleet?since=${told?.version ?? 0}`));
+    lost = "";
+    document.querySelector("main").classList.remove("old");
     say(summary());
     await show();
   } catch (error) {
@@ -90,16 +98,19 @@ async function load() {
 
 const showOpenBench = () => { if (told && !$("bench").hidden) bench.show().catch(failed); };
 
+// A browser opens six connections to one server for all its pages together. So a page that nobody sees gives its own back.
 function follow() {
   changes?.close();
+  if (document.hidden || !following) return;
   changes = new EventSource("api/changes");
   changes.onmessage = load;
   changes.addEventListener("bench", showOpenBench);
-  changes.onerror = () => { say("the monitor does not answer"); changes.close(); setTimeout(begin, 2000); };
+  changes.onerror = () => { silent(); changes.close(); setTimeout(begin, 2000); };
 }
 
 function logIn() {
-  changes?.close();
+  following = false;
+  follow();
   told = null;
   for (const id of Object.keys(VIEWS)) $(id).hidden = true;
   $("user").replaceChildren();
@@ -116,7 +127,7 @@ async function begin() {
   try {
     me = await get("api/me");
   } catch {
-    say("the monitor does not answer");
+    silent();
     setTimeout(begin, 2000);
     return;
   }
@@ -125,6 +136,7 @@ async function begin() {
   $("login").hidden = true;
   $("user").replaceChildren(...(me.user ? [text(`${me.user} `), make("button", "Log out", { type: "button", click: logOut })] : []));
   told = null; // the monitor may be another one
+  following = true;
   follow();
   await load();
 }
@@ -138,6 +150,7 @@ $("login").addEventListener("submit", async (event) => {
   if (answer.ok) await begin();
 });
 addEventListener("hashchange", show);
+document.addEventListener("visibilitychange", follow);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { sensor.leave(); bench.leave(); show(); });
 for (const one of Object.values(VIEWS)) one.start?.(go);
 setInterval(() => { if (told && !$("fleet").hidden) fleet.show(told, go); }, 30000); // ages grow without a change

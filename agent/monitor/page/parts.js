@@ -20,10 +20,21 @@ export const chip = (kind) => make("span", KINDS[kind][0], { class: `chip ${KIND
 // A count of a kind, which is a filter.
 export const tile = (title, count, tone, pressed, click) => make("button", [make("b", count), make("span", title)], { type: "button", class: `tile ${tone}`, "aria-pressed": String(pressed), click });
 
+// Copies a line. A browser gives the clipboard to pages of https and of its own machine alone; elsewhere the line, which
+// stands in `code`, is selected.
+export async function copy(line, code, told) {
+  try {
+    await navigator.clipboard.writeText(line);
+    told.replaceChildren(text("copied"));
+  } catch {
+    getSelection().selectAllChildren(code);
+    told.replaceChildren(text(document.execCommand("copy") ? "copied" : "selected: copy it with Ctrl+C"));
+  }
+}
+
 export function copier(line) {
-  const told = make("span", "", { role: "status", class: "hint" });
-  const click = () => navigator.clipboard.writeText(line).then(() => told.replaceChildren(text("copied")), () => told.replaceChildren(text("select the line and copy it")));
-  return make("div", [make("code", line, { tabindex: "0" }), make("button", "Copy", { type: "button", click, "aria-label": `Copy: ${line}` }), told], { class: "command" });
+  const told = make("span", "", { role: "status", class: "hint" }), code = make("code", line, { tabindex: "0" });
+  return make("div", [code, make("button", "Copy", { type: "button", click: () => copy(line, code, told), "aria-label": `Copy: ${line}` }), told], { class: "command" });
 }
 
 // Whether values may be used, as words.js says it.
