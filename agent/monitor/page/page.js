@@ -153,6 +153,7 @@ addEventListener("hashchange", show);
 document.addEventListener("visibilitychange", follow);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { sensor.leave(); bench.leave(); show(); });
 for (const one of Object.values(VIEWS)) one.start?.(go);
+$("zone").textContent = Intl.DateTimeFormat().resolvedOptions().timeZone;
 setInterval(() => { if (told && !$("fleet").hidden) fleet.show(told, go); }, 30000); // ages grow without a change
 setInterval(showOpenBench, 5000); // so does the silence of a bench
 begin();

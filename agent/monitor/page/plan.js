@@ -1,5 +1,5 @@
 // The plan view: the picture of the structure with the sensors on it, and where a person with the right puts them.
-import { $, full, get, make, NeedsLogin, placeOf, text } from "./common.js";
+import { $, clean, full, get, make, NeedsLogin, placeOf, text } from "./common.js";
 import { KINDS } from "./parts.js";
 
 const AGAIN_MS = 10000; // other people may change the plan; a change of the fleet comes far more often
@@ -77,14 +77,15 @@ function choose(name) {
 // The points stay the same elements while data come, so that none is rebuilt under a person's hands.
 const points = new Map();
 
-function point(row) {
+function point(row, label) {
   const name = full(row), [title, tone] = KINDS[row.kind], words = `${name}: ${title}${row.why ? `, ${row.why}` : ""}`;
   if (!points.has(name)) {
-    const made = make("a", [make("span", row.sensor)], { href: `#${placeOf(row)}`, draggable: "false", click: (event) => arranging && event.preventDefault(), keydown: (event) => press(event, name), pointerdown: (event) => drag(event, name) });
+    const made = make("a", [make("span")], { href: `#${placeOf(row)}`, draggable: "false", click: (event) => arranging && event.preventDefault(), keydown: (event) => press(event, name), pointerdown: (event) => drag(event, name) });
     points.set(name, made);
   }
   const made = points.get(name), [x, y] = plan.positions[name];
   made.className = `point ${tone}${x > 0.8 ? " left" : ""}`; // the name is where the picture has room for it
+  made.firstChild.textContent = clean(label);
   made.title = words;
   made.setAttribute("aria-label", words);
   made.style.left = `${100 * x}%`;
@@ -100,7 +101,8 @@ function draw() {
   $("plan-arrange").setAttribute("aria-pressed", arranging);
   $("plan-which").hidden = $("plan-off").hidden = $("plan-hint").hidden = !arranging;
   $("plan-picture").classList.toggle("arranging", arranging);
-  const shown = placed.map(point), there = [...$("plan-picture").querySelectorAll(".point")];
+  const alone = (row) => placed.filter((one) => one.sensor === row.sensor).length === 1;
+  const shown = placed.map((row) => point(row, alone(row) ? row.sensor : `${row.gateway} / ${row.sensor}`)), there = [...$("plan-picture").querySelectorAll(".point")];
   for (const old of there) if (!shown.includes(old)) old.remove();
   $("plan-picture").append(...shown.filter((one) => !there.includes(one)));
   const kinds = Object.keys(KINDS).filter((kind) => placed.some((row) => row.kind === kind));

@@ -236,7 +236,7 @@ function showHead(row, place, trends) {
   $("state").replaceChildren(make("span", say));
   $("usable").replaceChildren(...(row ? [may(covered(row, trends))] : []));
   $("beside-state").replaceChildren(make("span", more));
-  $("sensor-steps").replaceChildren(...(row ? steps(row, trends) : []), ...(row && row.kind === "sound" ? [make("p", "Nothing: it is in order.")] : []));
+  $("sensor-steps").replaceChildren(make("h3", "What to do:"), ...(row ? steps(row, trends) : []), ...(!row || row.kind === "sound" ? [make("p", row ? "Nothing: it is in order." : "Look at the names in the address.")] : []));
 }
 
 // The folded parts that a person has opened stay open.
