@@ -6,7 +6,7 @@ PRESET ?= plain
 # Images for containers set it. Then each program that a test starts would compile its sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run fleet test test-quick test-thorough test-all nightly lint bench faults faults-short soak lock deb container site clean
+.PHONY: run fleet pictures test test-quick test-thorough test-all nightly lint bench faults faults-short soak lock deb container site clean
 
 $(VENV)/runtime: requirements.lock requirements-build.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "fieldcal needs Python 3.11 or later, this is " + sys.version)'
@@ -28,6 +28,11 @@ fleet: $(VENV)/development  ## router, fleet page and a simulated fleet of 40 se
 	$(BIN)/fieldcal monitor --router --data-dir $$directory --keys $$directory/known.keys & monitor=$$!; \
 	trap 'kill $$monitor 2>/dev/null; wait $$monitor; rm -r $$directory' EXIT; trap : INT TERM; \
 	$(BIN)/fieldcal simulate --fleet 10 --sensors 4 --every 4 --age 365 --speed 86400 --keys $$directory/known.keys
+
+pictures: $(VENV)/development  ## the pictures of README and docs that show running programs: terminal, fleet page, bench page
+	$(BIN)/python -m docs.images.run_svg
+	$(BIN)/python -m tests.scenarios.fleet_page
+	$(BIN)/python -m tests.scenarios.bench_page
 
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
 once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }
