@@ -79,7 +79,8 @@ def run(browser: Any, monitor: Monitor, change: Any) -> dict[str, float]:
         "painted after, s": told["painted"] / 1e3, "bytes until then, kB": first / 1e3,
         "bytes 2 s later, kB": sum(received) / 1e3, "a change is seen after, s": seen_s,
         "longest task while scrolling, ms": max(tasks, default=0.0),
-        "layout shifts until then": unmoved, "by a change and its card": moved - unmoved,
+        "layout shifts until then": unmoved, "by a change, and by its card": moved - unmoved,
+        "cards that were announced": float(announced),
         "while scrolling": told["shifts"] - moved,
         "rows drawn after scrolling": page.locator("#groups .row").count(),
     }  # fmt: skip

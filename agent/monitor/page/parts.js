@@ -64,7 +64,9 @@ export function spark(label, curves, [from, to, low, high], marks = [], height =
   const line = (points) => points.map(([a, b]) => `${x(a).toFixed(1)},${y(b).toFixed(1)}`).join(" ");
   plot.append(drawn("line", { x1: 0, x2: 100, y1: y(0), y2: y(0), class: "zero" }));
   for (const { t, v, u, tone, dashed } of curves) {
-    const known = t.map((each, k) => [each, v[k], u?.[k]]).filter(([each, value]) => each >= from && finite(value));
+    const points = t.map((each, k) => [each, v[k], u?.[k]]).filter(([each, value]) => each >= from && finite(value));
+    // What is in force stays so until the next calibration.
+    const known = dashed ? points : points.flatMap(([each, ...rest], k) => (k ? [[each, ...points[k - 1].slice(1)], [each, ...rest]] : [[each, ...rest]]));
     const edge = (sign) => known.map(([each, value, half]) => [each, value + sign * half]);
     if (u && known.every(([, , half]) => finite(half))) plot.append(drawn("polygon", { points: line([...edge(1), ...edge(-1).reverse()]), class: `band ${tone}` }));
     plot.append(drawn("polyline", { points: line(known), class: `curve ${tone}${dashed ? " dashed" : ""}` }));

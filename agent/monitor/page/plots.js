@@ -2,6 +2,9 @@
 import { make } from "./common.js";
 import { finite, signed } from "./format.js";
 
+// What is in force stays so until the next calibration.
+const stays = uPlot.paths.stepped({ align: 1 });
+
 // A named value of page.css.
 export const named = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const colours = () => ["--x", "--y", "--z"].map(named);
@@ -35,11 +38,12 @@ export class TimePlots {
     const axis = axisOf(), series = [{}], data = [times], bands = [];
     for (const { label, values, u, tone, dashed } of one.series) {
       const colour = named(`--${tone}`), at = series.length;
-      series.push({ label, stroke: colour, width: 2, dash: dashed ? [5, 4] : undefined, points: { show: dashed || times.length < 60, size: 4 }, value: (_, v) => (v === null || v === undefined ? "–" : `${signed(v, one.digit)}${one.unit}`) });
+      const paths = dashed ? undefined : stays;
+      series.push({ label, stroke: colour, width: 2, paths, dash: dashed ? [5, 4] : undefined, points: { show: dashed || times.length < 60, size: 4 }, value: (_, v) => (v === null || v === undefined ? "–" : `${signed(v, one.digit)}${one.unit}`) });
       data.push(values);
       if (!u) continue;
       for (const k of [2, -2]) {
-        series.push({ edge: true, stroke: "transparent", points: { show: false } });
+        series.push({ edge: true, stroke: "transparent", paths, points: { show: false } });
         data.push(values.map((v, j) => (finite(v) && finite(u[j]) ? v + k * u[j] : null)));
       }
       bands.push({ series: [at + 1, at + 2], fill: `${colour}1c` });

@@ -71,7 +71,8 @@ function steady(row) {
 
 // What explains it best, by the other sensors with the same reference.
 function cause(beside) {
-  if (!beside?.count) return "No other sensor has this reference: nothing here tells sensor from reference.";
+  if (!beside) return "";
+  if (!beside.count) return "No other sensor has this reference: nothing here tells sensor from reference.";
   const others = `${beside.count - beside.changed} of ${beside.count} other sensors with the same reference are steady`;
   return beside.changed * 2 >= beside.count ? `Only ${others}: look at the reference first.` : `${others}: rather this sensor than its reference.`;
 }
@@ -175,7 +176,7 @@ export function cardPlot(row, trends) {
   const verdict = row.verdicts[0], trend = verdict && trends.found?.[verdict.parameter], beyond = trends.estimates ?? [], later = beyond.map((e) => e.t_utc_ns);
   const marks = trends.refused_utc_ns ? [trends.held_utc_ns] : [], to = row.kind === "silent" ? trends.t_utc_ns.at(-1) : timeOf(row), stays = row.kind !== "silent" && row.kind !== "no data";
   const more = { marks, to, refused: trends.refused_utc_ns ?? [], dashed: later.length > 0 };
-  if (!trend?.t_utc_ns.length) return [small(trends.main_pct.flatMap((v, i) => [going(trends.t_utc_ns, v, null, AXES[i], stays && to), ...estimated(later, beyond.map((e) => e.main_pct[i]), null, AXES[i])]), " %", "Sxx, Syy, Szz", more)];
+  if (!trend?.t_utc_ns.length) return [small(trends.main_pct.flatMap((v, i) => [going(trends.t_utc_ns, v, null, AXES[i], stays && to), ...estimated(later, beyond.map((e) => e.main_pct[i]), null, AXES[i])]), " %", "Main S", more)];
   const { unit, factor } = scaled(verdict.parameter, trend.scale), first = trend.values[0], k = NAMES.indexOf(verdict.parameter), tone = toneOf(verdict.parameter);
   const part = (v) => (finite(v) ? (v - first) * factor : null), u = (v) => 2 * v * factor, onset = trend.change?.onset_utc_ns ?? verdict.onset_utc_ns;
   const curves = [going(trend.t_utc_ns, trend.values.map(part), trend.u.map(u), tone, stays && to), ...estimated(later, beyond.map((e) => part(e.values[k])), beyond.map((e) => u(e.u[k])), tone)];
@@ -189,8 +190,8 @@ const estimated = (t, v, u, tone) => (t.length ? [{ t, v, u, tone, dashed: true 
 function small(curves, unit, name, { marks, to, refused, dashed }) {
   const all = curves.flatMap(({ v, u }) => v.flatMap((each, k) => [each - (u?.[k] ?? 0), each + (u?.[k] ?? 0)])).filter(finite), from = curves[0].t[0];
   const least = unit === " %" ? LEAST_PCT : 0, low = Math.min(-least, ...all), high = Math.max(least, ...all), label = `${name}: ${signed(low, 0.1 * (high - low))} to ${signed(high, 0.1 * (high - low))}${unit}`;
-  const words = [label, dashed ? "dashed: estimates, not in force" : "", refused.length ? "▴ windows held" : ""].filter(Boolean).join("; ");
-  return make("figure", [spark(`${words}, from ${utcDay(from)} to ${utcDay(to)}`, curves, [from, to, low, high], marks, 46, refused),
+  const words = `${label}${dashed ? "; dashed: estimates" : ""}`;
+  return make("figure", [spark(`${words}${refused.length ? "; triangles: windows that are held" : ""}, from ${utcDay(from)} to ${utcDay(to)}`, curves, [from, to, low, high], marks, 46, refused),
     make("figcaption", [make("span", words, { class: "of" }), day(from), day(to)])]);
 }
 const utcDay = (ns) => day(ns).textContent;
