@@ -85,6 +85,7 @@ class Fleet:
         self._told: dict[tuple[str, str], GatewayTold] = {}
         self._doubled: dict[tuple[str, str], int] = {}
         self._in_turns: set[tuple[str, str]] = set()
+        self._mixed_utc_ns: dict[tuple[str, str], int] = {}  # since when gateways are in one of the two
         self._gateways: set[tuple[str, str]] = set()
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
         self._made: dict[Place, dict[str, Any]] = {}  # the row of each sensor
@@ -214,6 +215,8 @@ class Fleet:
         found, turns = {_place(source): count for source, count in doubled.items()}, set(map(_place, in_turns))
         with self._mutex:
             changed = found.keys() ^ self._doubled.keys() | turns ^ self._in_turns
+            now_ns, mixed = self._now_ns(), found.keys() | turns
+            self._mixed_utc_ns = {gateway: self._mixed_utc_ns.get(gateway, now_ns) for gateway in mixed}
             self.version += (found, turns) != (self._doubled, self._in_turns)
             self._doubled, self._in_turns = found, turns
             for gateway in changed:
@@ -251,7 +254,7 @@ class Fleet:
             rows = [
                 _gateway_row(place, counts[place], place in self._alive, self._told.get(place),
                              refused.get("/".join(place), 0), self._doubled.get(place, 1),
-                             in_turns=place in self._in_turns)
+                             in_turns=place in self._in_turns) | {"mixed_utc_ns": self._mixed_utc_ns.get(place)}
                 for place in self._gateways | {_place(source) for source in refused}
             ]  # fmt: skip
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
@@ -260,7 +263,7 @@ class Fleet:
         if place not in self._made:
             gateway = place[:2]
             heard = place not in self._silent and gateway in self._alive
-            doubled = self._doubled.get(gateway, 1) > 1 or gateway in self._in_turns
+            doubled = gateway in self._mixed_utc_ns
             of = {"heard_utc_ns": self._heard[place].at_ns, "changed": self._changed[place]}
             row = _row(place, self._newest[place], self._state_of(gateway), heard=heard, doubled=doubled)
             self._made[place] = row | of
@@ -440,7 +443,6 @@ def _gateway_row(
         "told_utc_ns": told.t_utc_ns if told else None,
         "refused": refused,
         "instances": instances,
-        "in_turns": in_turns,
         "why": "; ".join(why),
     }
 

@@ -129,7 +129,8 @@ def test_colours_come_from_verdicts_and_hearing_alone() -> None:
 
 
 def test_a_sensor_that_is_held_and_has_stepped_is_held() -> None:
-    fleet = Fleet(Clock())
+    now = Clock()
+    fleet = Fleet(now)
     fleet.set_alive("site", "gw", True)
     fleet.take(*PLACE, "status", fields_of(status(1, "HELD")))
     fleet.take(*PLACE, "drift", verdict(verdict="stepped"))
@@ -140,6 +141,10 @@ def test_a_sensor_that_is_held_and_has_stepped_is_held() -> None:
     assert kind(fleet) == "changed"  # an adopted step needs a person too, and does not drift
     fleet.set_doubled({"site/gw": 2})
     assert kind(fleet) == "doubled"  # of two gateways with one name nobody knows whose results these are
+    now.ns += SECOND_NS
+    fleet.set_doubled({}, ["site/gw"])  # one of them has left, and comes back in turns
+    assert kind(fleet) == "doubled"
+    assert [row["mixed_utc_ns"] for row in fleet.gateways({})] == [NOW_NS]
     fleet.set_doubled({})
     assert kind(fleet) == "changed"
 

@@ -1,6 +1,6 @@
 // The fleet view: counts by kind, cards of what needs a person, all sensors by gateway, and the gateways.
 import { $, clean, full, get, make, placeOf, table, text, view } from "./common.js";
-import { ago, AXES, band, day, DAY_NS, finite, now, signed, two } from "./format.js";
+import { ago, AXES, band, day, DAY_NS, finite, moment, now, signed, two } from "./format.js";
 import { card, chip, KINDS, spark, tile } from "./parts.js";
 import { saveTable } from "./picture.js";
 import { cardPlot, certificate, covered, largest, NO_VERDICT, ofDoubled, shortName, stateOf, steps, timeOf, told as toldOf } from "./words.js";
@@ -43,7 +43,7 @@ function showCounts(sensors, kind, go) {
 
 // A card for each sensor, or for a gateway whose sensors are not heard or are mixed with others; the worst first.
 function needs(sensors, gateways) {
-  const rank = (row) => WORST.indexOf(row.kind), byGateway = ["silent", "doubled"], found = [], kindOf = (gateway) => (gateway.instances > 1 || gateway.in_turns ? "doubled" : "gateway");
+  const rank = (row) => WORST.indexOf(row.kind), byGateway = ["silent", "doubled"], found = [], kindOf = (gateway) => (gateway.mixed_utc_ns ? "doubled" : "gateway");
   const silent = Map.groupBy(sensors.filter((row) => row.kind === "silent"), gatewayOf);
   for (const row of sensors.filter((one) => rank(one) >= 0 && !byGateway.includes(one.kind))) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? 0 });
   for (const [name, rows] of silent) found.push({ key: `gateway ${name}`, row: rows.reduce((a, b) => ((b.last_good_utc_ns ?? 0) < (a.last_good_utc_ns ?? 0) ? b : a)), rows, rank: WORST.indexOf("silent"), size: rows.length });
@@ -57,7 +57,7 @@ const ofGateway = (kind) => (kind !== "doubled" ? { steps: [make("p", "The state
 });
 
 function drawn({ row, rows, gateway, kind }) {
-  if (gateway) return card({ kind, name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`, say: `${gateway.why}.`, more: [], plot: null, ...ofGateway(kind) });
+  if (gateway) return card({ kind, name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`, say: [`${gateway.why}.`, ...(gateway.mixed_utc_ns ? [" Noticed ", moment(gateway.mixed_utc_ns), "."] : [])], more: [], plot: null, ...ofGateway(kind) });
   const found = trends.get(full(row))?.told, { say, more } = toldOf(row, found), usable = covered(row, found);
   if (rows) {
     const moved = rows.filter((one) => one.verdicts.length).map((one) => one.sensor), names = rows.slice(0, 6).map((one) => one.sensor).join(", ");
