@@ -11,7 +11,7 @@ import re
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
@@ -41,6 +41,8 @@ _MAIN_NAMES = frozenset(PARAMETERS[i] for i in MAIN)
 # Fields of a verdict that a row has.
 VERDICT = ("parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "t_utc_ns",
            "false_alarms_a_year")  # fmt: skip
+# What a row adds to it: see Fleet.recall.
+SINCE_STABLE = ("first_utc_ns", "drifts")
 # As calib.state.state.DATED puts the date of the certificate behind the identity of a reference.
 _CALIBRATED = re.compile(r"(.*), calibrated ([0-9]{4}-[0-9]{2}-[0-9]{2})", re.DOTALL)
 IN_TURNS = (
@@ -81,6 +83,7 @@ class Fleet:
         self._silent: set[Place] = set()  # that have not been heard for SILENT_INTERVALS
         self._looked_ns = 0
         self._newest: dict[Place, dict[str, dict[str, Any]]] = {}
+        self._since_stable: dict[tuple[Place, str], tuple[int, bool]] = {}  # as SINCE_STABLE, by parameter
         self._alive: set[tuple[str, str]] = set()
         self._told: dict[tuple[str, str], GatewayTold] = {}
         self._doubled: dict[tuple[str, str], int] = {}
@@ -119,6 +122,8 @@ class Fleet:
         with self._mutex:
             self._knows((site, gateway))
             place = site, gateway, sensor
+            if what == "drift":
+                fields = fields | self._judged(place, fields)
             self._newest.setdefault(place, {})[part] = fields
             self._heard.setdefault(place, _Heard()).take(self._now_ns() if fresh else fields["t_utc_ns"], fresh=fresh)
             self._silent.discard(place)
@@ -128,6 +133,25 @@ class Fleet:
             self.note(
                 site, gateway, sensor, what, fields["t_utc_ns"], told, alarm=fresh and _needs_a_person(what, fields)
             )
+
+    def recall(self, place: Place, verdicts: Sequence[dict[str, Any]]) -> None:
+        """Take earlier drift verdicts of a sensor, oldest first, after a restart.
+
+        Of each parameter a row says when it was first told since it was last stable (`first_utc_ns`), and whether it
+        was told to drift since then (`drifts`): a step that is told of it later does not end its drift.
+        """
+        with self._mutex:
+            for fields in verdicts:
+                if fields["parameter"] in PARAMETERS:
+                    self._judged(place, fields)
+
+    def _judged(self, place: Place, fields: Mapping[str, Any]) -> dict[str, Any]:
+        key = place, fields["parameter"]
+        first_utc_ns, drifts = self._since_stable.pop(key, (fields["t_utc_ns"], False))
+        if fields["verdict"] == "stable":
+            return {}
+        self._since_stable[key] = first_utc_ns, drifts or fields["verdict"] == "drifting"
+        return dict(zip(SINCE_STABLE, self._since_stable[key], strict=True))
 
     def note(
         self, site: str, gateway: str, sensor: str, what: str, t_utc_ns: int, told: str, *, alarm: bool = False
@@ -359,7 +383,7 @@ def _row(
     status, calibration = newest.get("status", {}), newest.get("calibration", {})
     verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
     reference, calibrated_utc_ns = dated(_reference(newest))
-    told = [drift["verdict"] for drift in verdicts]
+    told = ["drifting" if drift["drifts"] else "stepped" for drift in verdicts]
     why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
     if status.get("status") in NEEDS_A_PERSON:
         why.insert(0, f"{status['status']}: {status['reason']}")
@@ -378,7 +402,7 @@ def _row(
         "status_utc_ns": status.get("t_utc_ns"),
         "reason": clipped(status.get("reason", "")),
         "gateway_state": gateway_state,
-        "verdicts": [{name: drift[name] for name in VERDICT} for drift in verdicts],
+        "verdicts": [{name: drift[name] for name in (*VERDICT, *SINCE_STABLE)} for drift in verdicts],
         "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
         "u_pct": _u_pct(calibration),
         "band_hz": calibration.get("valid_band_hz", []),

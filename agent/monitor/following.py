@@ -38,6 +38,7 @@ LOOK_S = 1.0  # s between two looks whether the router still hears
 LOG_S = 60.0  # s between two lines of the log about the same thing
 # Results in one transaction at most: what PostgreSQL takes for one is shared, and SQLite delays no question for long.
 BATCH = 100
+VERDICTS = 200  # on one sensor, the newest, that are looked at after a restart
 TOKENS = 10_000  # changes of presence that may wait
 GUIDES = 100  # messages of benches that may wait; each one says all
 # What SQLite says of a result; all its other errors are of the file, the disk, or another program that has locked it.
@@ -75,7 +76,14 @@ class Following:
         self._stop = threading.Event()
         self._hearing = Hearing()  # of the session for presence and health; the consumer looks after its own
         self._open = ExitStack()
-        self._each(database.newest(), lambda place: fleet.take(*place, fresh=False))
+        newest = database.newest()
+        changed = {
+            (site, gateway, sensor)
+            for site, gateway, sensor, what, fields in newest
+            if what == "drift" and fields.get("verdict") in ("drifting", "stepped")
+        }
+        self._each(sorted(changed), lambda place: fleet.recall(place, database.history(*place, "drift", VERDICTS)))
+        self._each(newest, lambda place: fleet.take(*place, fresh=False))
         self._thread = threading.Thread(target=self._run, name="following", daemon=True)
         self._thread.start()
 

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from agent.acquisition.service import Service
 from agent.cli.run import LOOPBACK, router, virtual_bench
+from agent.cli.stopping import Run
 from agent.terminal.screen import Picture
 from agent.terminal.watch import Watch
 
@@ -26,7 +27,7 @@ def main() -> None:
     """Run for a minute, draw the last state."""
     with ExitStack() as stack:
         os.chdir(stack.enter_context(tempfile.TemporaryDirectory()))
-        said = stack.enter_context(router(LOOPBACK))
+        said = stack.enter_context(router(LOOPBACK, Run()))
         config, truth = stack.enter_context(virtual_bench("plain", 1))
         watch = stack.enter_context(Watch(config, "virtual bench, plain", truth))
         watch.say(said)

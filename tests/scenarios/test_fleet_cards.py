@@ -104,7 +104,7 @@ def test_each_kind_of_sensor_says_what_it_is_and_whether_its_values_may_be_used(
                     const { covered } = await import('./words.js'), { make } = await import('./common.js'), ns = 1e6 * Date.now(), day = 86400e9;
                     const at = (v) => (typeof v === 'number' && v < 0 ? ns + v * day : v), of = Object.entries(change).map(([k, v]) => [k, at(v)]);
                     const row = { kind: 'sound', status: 'VALID', status_utc_ns: ns, reason: '', verdicts: [], u_pct: 0.42, band_hz: [1, 18], calibration_utc_ns: ns, last_good_utc_ns: ns, ...Object.fromEntries(of) };
-                    if (row.verdicts.length) row.verdicts = [{ parameter: 'Sxx', onset_utc_ns: at(row.verdicts[0]), t_utc_ns: at(row.verdicts[1]) }];
+                    if (row.verdicts.length) row.verdicts = [{ parameter: 'Sxx', onset_utc_ns: at(row.verdicts[0]), first_utc_ns: at(row.verdicts[1]) }];
                     return make('p', covered(row, {})[1]).textContent;
                 }""",  # noqa: E501
                 change,

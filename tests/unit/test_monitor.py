@@ -11,9 +11,13 @@ from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+import msgspec
 import pytest
 
+from agent.core.events import DriftReport
+from agent.delivery.keys import Address
 from agent.delivery.publication import Publisher
+from agent.delivery.received import Received
 from agent.delivery.store import Store
 from agent.keys.certificates import issue, make_authority
 from agent.keys.files import write_new
@@ -21,7 +25,7 @@ from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
-from tests.unit.monitor_site import Monitor, many
+from tests.unit.monitor_site import Monitor, Served, many
 
 HOSTILE = "<img src=x onerror=\"document.title='owned'\">"
 
@@ -59,6 +63,22 @@ def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway:
         assert "count" in monitor.get(f"sensor.csv?{asked}calibration")
     finally:
         monitor.stop(signal.SIGTERM)
+
+
+def test_a_drift_stays_one_over_a_restart(site: Site, tmp_path: Path) -> None:
+    place = ("site", "gw", "mems")
+    with Served(site, tmp_path / "monitor") as served:
+        for number, told in enumerate(("drifting", "stepped"), start=1):
+            drift = DriftReport(run_id="r", sequence=number, sensor="mems", t_utc_ns=number, parameter="Sxx",
+                                verdict=told, change=1.0, u_change=1.0, rate=0.0, u_rate=0.0, onset_utc_ns=1, statistic=1.0,
+                                threshold=1.0, false_alarms_a_year=0.1, reason="r")  # fmt: skip
+            fields = json.loads(msgspec.json.encode(drift))
+            served.database.add([Received("", Address(*place, "drift"), number, fields, None)])
+    with Served(site, tmp_path / "monitor") as served:
+        served.fleet.set_alive("site", "gw", True)
+        (row,) = served.fleet.rows()
+        assert (row["kind"], row["verdicts"][0]["first_utc_ns"]) == ("drifting", 1)
+        assert len(served.fleet.events()) == 1
 
 
 @pytest.mark.slow

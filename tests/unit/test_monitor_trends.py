@@ -149,6 +149,23 @@ def test_a_sensor_that_is_held_and_has_stepped_is_held() -> None:
     assert kind(fleet) == "changed"
 
 
+def test_a_step_that_is_told_of_a_drift_does_not_end_it_also_after_a_restart() -> None:
+    told = [verdict(verdict=each, t_utc_ns=NOW_NS + day * DAY_NS)
+            for day, each in enumerate(["drifting", "stable", "stepped", "drifting", "stepped"])]  # fmt: skip
+    for count, expected in ((3, "changed"), (4, "drifting"), (5, "drifting")):
+        rows = []
+        for restarted in (False, True):
+            fleet = Fleet(Clock())
+            fleet.set_alive("site", "gw", True)
+            fleet.take(*PLACE, "status", fields_of(status(1)))
+            if restarted:
+                fleet.recall(PLACE, [*told[:count], verdict(parameter="invented")])
+            for each in told[count - 1 : count] if restarted else told[:count]:
+                fleet.take(*PLACE, "drift", each)
+            rows += [[(row["kind"], row["verdicts"][0]["first_utc_ns"]) for row in fleet.rows()]]
+        assert rows == 2 * [[(expected, NOW_NS + 2 * DAY_NS)]]
+
+
 def test_a_gateway_that_catches_up_needs_no_person() -> None:
     fleet = Fleet(Clock())
     fleet.set_alive("site", "gw", True)

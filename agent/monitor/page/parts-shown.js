@@ -11,7 +11,7 @@ const drift = t.map((_, k) => Math.max(0, k - 12) * 0.05 + noise(k, 1)), calm = 
 
 // A row of api/fleet, and what api/trends tells of its history.
 const row = (sensor, more) => ({ site: "bridge", gateway: "span-2", sensor, kind: "sound", status: "VALID", status_utc_ns: t[1], reason: "", verdicts: [], u_pct: 0.42, band_hz: [1, 18], reference: "B12 4711", calibration_utc_ns: today, last_good_utc_ns: today, heard_utc_ns: today, result_utc_ns: today, estimate: 12, estimate_utc_ns: today, ...more });
-const verdict = (parameter, kind, k, change, rate) => ({ parameter, verdict: kind, change, u_change: 26, rate, u_rate: 0.2, onset_utc_ns: t[k], t_utc_ns: t[k + 8], false_alarms_a_year: 0.1 });
+const verdict = (parameter, kind, k, change, rate) => ({ parameter, verdict: kind, change, u_change: 26, rate, u_rate: 0.2, onset_utc_ns: t[k], t_utc_ns: t[k + 8], first_utc_ns: t[k + 8], drifts: kind === "drifting", false_alarms_a_year: 0.1 });
 const history = (main, more) => ({ t_utc_ns: t, main_pct: main, accepted: true, changes: NAMES.map((_, i) => ({ change: i === 8 ? 65 : 10, U: 26 })), beside: { count: 17, changed: 1 }, held_utc_ns: t[49], found: {}, ...more });
 const found = (v, parameter, part, u, change) => ({ [parameter]: { t_utc_ns: part, values: v.slice(0, part.length).map((pct) => S * (1 + pct / 100)), u: part.map(() => (u * S) / 200), scale: S, change } });
 const bent = (size, u_size) => ({ shape: "drifting", onset_utc_ns: t[12], u_onset_days: 3, size: (size * S) / 100, u_size: (u_size * S) / 200, rate: (size * S) / 23500, u_rate: (u_size * S) / 47000 });

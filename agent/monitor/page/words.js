@@ -50,7 +50,7 @@ export function covered(row, trends) {
     const hold = ON_HOLD.test(row.reason);
     return [hold ? "warn" : "bad", [make("b", ["Values since ", day(last), hold ? " are not checked" : " may not be used"]), hold ? ": an operator put the calibration on hold. " : ": windows contradict S and Q in force, and U does not cover it. ", ...(good ? ["Earlier ones may: ", ...U, "."] : [])]];
   }
-  const changes = row.verdicts.map((v) => [trends?.found?.[v.parameter]?.change?.onset_utc_ns ?? v.onset_utc_ns, v.t_utc_ns]), from = Math.min(...changes.map(([onset]) => onset)), told = Math.max(...changes.map(([, at]) => at)), followed = Math.max(told, trends?.adopted_utc_ns ?? 0);
+  const changes = row.verdicts.map((v) => [trends?.found?.[v.parameter]?.change?.onset_utc_ns ?? v.onset_utc_ns, v.first_utc_ns]), from = Math.min(...changes.map(([onset]) => onset)), told = Math.max(...changes.map(([, at]) => at)), followed = Math.max(told, trends?.adopted_utc_ns ?? 0);
   if (changes.length && row.calibration_utc_ns < told) return ["bad", [make("b", ["Values since ", day(from), " may not be used"]), ": S and Q in force are of ", day(row.calibration_utc_ns), " and do not follow the change. Earlier ones may: ", ...U, "."]];
   const old = timeOf(row) - row.calibration_utc_ns > DAY_NS ? [" (of ", day(row.calibration_utc_ns), ")"] : [];
   const late = changes.length ? ["; S and Q follow the change. Values of ", day(from), " to ", day(followed), ", before they did, may be wrong by it"] : [];
