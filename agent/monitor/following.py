@@ -29,7 +29,7 @@ from agent.delivery.verifying import Refusals, UnverifiedError
 from agent.monitor.benches import Benches
 from agent.monitor.database import Database
 from agent.monitor.engines import DatabaseError
-from agent.monitor.fleet import Fleet
+from agent.monitor.fleet import Fleet, Place
 
 RECONNECT_S = 2.0  # s between two attempts to reach a router
 AGAIN_S = 1.0  # s between two attempts to write to a database that cannot be written
@@ -82,7 +82,11 @@ class Following:
             for site, gateway, sensor, what, fields in newest
             if what == "drift" and fields.get("verdict") in ("drifting", "stepped")
         }
-        self._each(sorted(changed), lambda place: fleet.recall(place, database.history(*place, "drift", VERDICTS)))
+
+        def recall(place: Place) -> None:
+            fleet.recall(place, database.history(*place, "drift", VERDICTS))
+
+        self._each(sorted(changed), recall)
         self._each(newest, lambda place: fleet.take(*place, fresh=False))
         self._thread = threading.Thread(target=self._run, name="following", daemon=True)
         self._thread.start()

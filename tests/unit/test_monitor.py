@@ -70,8 +70,8 @@ def test_a_drift_stays_one_over_a_restart(site: Site, tmp_path: Path) -> None:
     with Served(site, tmp_path / "monitor") as served:
         for number, told in enumerate(("drifting", "stepped"), start=1):
             drift = DriftReport(run_id="r", sequence=number, sensor="mems", t_utc_ns=number, parameter="Sxx",
-                                verdict=told, change=1.0, u_change=1.0, rate=0.0, u_rate=0.0, onset_utc_ns=1, statistic=1.0,
-                                threshold=1.0, false_alarms_a_year=0.1, reason="r")  # fmt: skip
+                                verdict=told, change=1.0, u_change=1.0, rate=0.0, u_rate=0.0, onset_utc_ns=1,
+                                statistic=1.0, threshold=1.0, false_alarms_a_year=0.1, reason="r")  # fmt: skip
             fields = json.loads(msgspec.json.encode(drift))
             served.database.add([Received("", Address(*place, "drift"), number, fields, None)])
     with Served(site, tmp_path / "monitor") as served:
