@@ -12,7 +12,8 @@ const SCALE_PCT = 1; // of the small plots of the table, all alike
 const AGAIN_MS = 60000; // after which the histories of rows that are seen are asked for again
 const ASKED = 25; // sensors in one question
 const GATEWAYS_MAX = 500; // rows of the table of gateways
-let shownCards = CARDS;
+const WAIT_MS = 400; // for the histories of the first cards
+let shownCards = CARDS, drawnFrom = null; // from when on cards and rows are drawn
 const groups = new Map(); // by site/gateway: {element, body, rows, built, open}
 const trends = new Map(); // by name: {at, told}; what the histories of seen sensors tell
 const cards = new Map(); // by key: {element, from}
@@ -112,7 +113,7 @@ function ask(rows) {
     const name = full(row), before = trends.get(name);
     if (!before || (before.changed !== row.changed && performance.now() - before.at > AGAIN_MS) || before.state !== stateOfRow(row)) waiting.set(name, row);
   }
-  if (!asking && waiting.size) { asking = true; setTimeout(answer, 30); }
+  if (!asking && waiting.size) { asking = true; setTimeout(answer, drawnFrom > performance.now() ? 0 : 30); }
 }
 
 async function answer() {
@@ -122,7 +123,8 @@ async function answer() {
     const found = await get(`api/trends?${new URLSearchParams(rows.map(([name]) => ["of", name]))}`);
     for (const [name, row] of rows) trends.set(name, { at: performance.now(), changed: row.changed, state: stateOfRow(row), told: found[name] ?? {} });
     for (const [name, row] of rows) groups.get(gatewayOf(row))?.built?.get(name)?.history(found[name] ?? {});
-    if (latest && rows.some(([name]) => cards.has(name))) showCards(latest.sensors, latest.gateways, filterOf());
+    if (drawnFrom > performance.now()) drawnFrom = 0;
+    if (latest && (!drawnFrom || rows.some(([name]) => cards.has(name)))) show(latest, changing);
   } catch {
     // The next change asks again; the page says meanwhile that the monitor does not answer.
   }
@@ -244,6 +246,19 @@ function showTable(sensors, gateways, filter) {
 
 // --- the view
 
+// The first cards and rows come with the histories of the cards, so that no card grows under the eyes of who reads.
+function waits(sensors, gateways, filter) {
+  if (drawnFrom === null && sensors.length) {
+    drawnFrom = performance.now() + WAIT_MS;
+    const first = needs(sensors.filter((row) => wanted(row, filter)), gateways).slice(0, CARDS).filter((need) => need.row && !need.rows);
+    if (!first.length) drawnFrom = 0;
+    ask(first.map((need) => need.row));
+    setTimeout(() => latest && show(latest, changing), WAIT_MS + 1);
+  }
+  $("fleet").classList.toggle("waits", drawnFrom > performance.now());
+  return drawnFrom > performance.now();
+}
+
 let latest = null, changing = () => undefined;
 const filterOf = () => ({ kind: view().get("kind") ?? "", words: (view().get("filter") ?? "").toLowerCase() });
 
@@ -253,6 +268,7 @@ export function show(told, go) {
   const filter = filterOf();
   if ($("filter").value !== (view().get("filter") ?? "")) $("filter").value = view().get("filter") ?? "";
   showCounts(told.sensors, filter.kind, go);
+  if (waits(told.sensors, told.gateways, filter)) return;
   showCards(told.sensors, told.gateways, filter);
   showTable(told.sensors, told.gateways, filter);
   const rows = told.gateways.slice(0, GATEWAYS_MAX).map((g) => [gatewayOf(g), g.alive ? "yes" : "no", g.state, g.sensors, g.version, make("span", g.why, { class: "why" })]), key = JSON.stringify(told.gateways);

@@ -29,7 +29,7 @@ export function sentence(verdict, trend) {
   const down = of.size < 0, unsure = ["It is sure that it does, but not by how much: ", ...size];
   if ((change?.shape ?? verdict.verdict) === "stepped") {
     const fell = [...name, down ? " fell" : " rose"];
-    return (sized ? [...fell, " by ", ...size, " at once, on ", ...since, told] : [...fell, " at once, on ", ...since, ". ", ...unsure, told]).flat();
+    return (sized ? [...fell, " by ", ...size, " at once, on ", ...since, "."] : [...fell, " at once, on ", ...since, ". ", ...unsure, "."]).flat();
   }
   const days = Math.abs(of.rate * factor * MONTH_DAYS) < 0.1 ? [YEAR_DAYS, "year"] : [MONTH_DAYS, "month"];
   const rate = [...pair(of.rate * factor * days[0], 2 * of.u_rate * factor * days[0], unit), ` a ${days[1]}`], falls = [...name, down ? " falls" : " rises"];
@@ -144,8 +144,10 @@ export function told(row, trends) {
 
 const BELOW = " by the command below";
 // What the agent says there is to do, without the command, which stands below; the mount where it knows nothing better.
-function advice(reason) {
-  const why = explanation(reason), told = why?.best && why.todo.replace(/: fieldcal command accept --sequence \d+$/, BELOW).replace(/([^.])$/, "$1.");
+// Since it said that no estimate can be put in force one may have come (`waits`).
+function advice(reason, waits) {
+  const why = explanation(reason), todo = waits ? why?.todo.replace(/ Otherwise: no estimate can be put in force.*$/, "") : why?.todo;
+  const told = why?.best && todo.replace(/: fieldcal command accept --sequence \d+$/, BELOW).replace(/([^.])$/, "$1.");
   if (told?.startsWith("Correct it")) return `Another ${why.best}? ${told}`;
   return told || "Look at the mount. If it is loose, fasten it: windows that fit again end HELD.";
 }
@@ -156,7 +158,7 @@ export const ofDoubled = () => [make("p", "Find the copy (its log says it too), 
 export function steps(row, trends) {
   const gateway = `${row.site}/${row.gateway}`, order = (verb, given) => commandLine({ gateway, sensor: row.sensor, verb, arguments: given }, "--connect ENDPOINT");
   const waits = row.estimate && row.estimate_utc_ns >= (trends?.held_utc_ns ?? row.status_utc_ns) && row.status === "HELD";
-  const told = row.kind === "held" ? advice(row.reason) : "", asked = told.includes(BELOW) ? [] : [make("p", `If the sensor has really changed, accept estimate ${row.estimate}:`)];
+  const told = row.kind === "held" ? advice(row.reason, waits) : "", asked = told.includes(BELOW) ? [] : [make("p", `If the sensor has really changed, accept estimate ${row.estimate}:`)];
   const accept = waits ? [...asked, copier(order("accept", { sequence: row.estimate }))] : [];
   if (row.kind === "silent") return [make("p", "Look at power and network, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "changed") return [make("p", "Find out what happened to it: mount, cable, temperature, reference. Compare it with another reference."), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`)];
