@@ -138,14 +138,15 @@ class CommandedGateway:
 
 
 def ask(page: Any) -> list[dict[str, str]]:
-    """What one screen says of the five worst: which (`who`, `kind`), since when, how sure and why (`say`, `more`), and
-    what next (`next`). Only what a person sees without scrolling."""
+    """What one screen says of the five worst: which (`who`, `kind`), since when, how sure and why (`say`, `more`),
+    whether values may be used (`usable`), and what next (`next`). Only what a person sees without scrolling."""
     found: list[dict[str, str]] = page.evaluate(
         """() => [...document.querySelectorAll('#cards .card')].filter((card) => {
             const { top, bottom } = card.getBoundingClientRect();
             return top >= 0 && bottom <= innerHeight;
         }).map((card) => ({ who: card.querySelector('h3 a')?.textContent ?? card.querySelector('h3').textContent,
             kind: card.querySelector('.chip').textContent, say: card.querySelector('.say').textContent,
+            usable: card.querySelector('.may').textContent,
             more: card.querySelector('.more').textContent, next: card.querySelector('.do').textContent }))"""
     )
     return found

@@ -58,7 +58,12 @@ def assert_the_five_questions_are_answered(shown: PageSite, page: Any) -> None:
     """Which, since when, how sure, why, what next, by what the fleet was made to do; on one screen."""
     page.get_by_label("Find a sensor").fill("")
     page.wait_for_function("() => document.querySelectorAll('#cards .card').length > 4")
+    page.set_viewport_size({"width": 1440, "height": 900})
+    page.wait_for_function("() => document.querySelectorAll('#cards .curve').length > 0")
     answers = {answer["who"]: answer for answer in ask(page)}
+    assert len(answers) == 5
+    assert all(re.search("Values .*(may|are|nobody)", answer["usable"]) for answer in answers.values()), answers
+    page.set_viewport_size({"width": 1440, "height": 1800})
 
     def of(behaviour: Behaviour) -> tuple[dict[str, str], str]:
         """The card of the odd sensor, and the day on which it became so: of 30 rounds, ten days apart."""

@@ -12,7 +12,7 @@ const SCALE_PCT = 1; // of the small plots of the table, all alike
 const AGAIN_MS = 60000; // after which the histories of rows that are seen are asked for again
 const ASKED = 25; // sensors in one question
 const GATEWAYS_MAX = 500; // rows of the table of gateways
-const WAIT_MS = 400; // for the histories of the first cards
+const WAIT_MS = 600; // for the histories of the first cards
 let shownCards = CARDS, drawnFrom = null; // from when on cards and rows are drawn
 const groups = new Map(); // by site/gateway: {element, body, rows, built, open}
 const trends = new Map(); // by name: {at, told}; what the histories of seen sensors tell
