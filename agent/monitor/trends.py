@@ -40,8 +40,8 @@ class Trends:
         """`t_utc_ns` (n) and `main_pct` (3, n): a year of the main sensitivities as changes since the calibration of
         `accepted_utc_ns`; `changes`: of each parameter its change and U of that; `budget`: what makes u of the main
         sensitivities (3), by source; `found`: of each verdict what the history tells; `held_utc_ns`: since when the
-        status is what it is; `adopted_utc_ns`: when a jump last came into force; `beside`: Fleet.beside. Where the
-        status is HELD also `refused_utc_ns`: when a window since then was not used, thinned; and `estimates`: the
+        status is what it is; `adopted_utc_ns`: when a jump last came into force since then; `beside`: Fleet.beside.
+        Where the status is HELD also `refused_utc_ns`: when a window since then was not used, thinned; and `estimates`: the
         newest ones after the calibration in force, each with `t_utc_ns`, `main_pct` (3), `values` and `u` (12).
 
         {} where no calibration is known.
@@ -76,7 +76,9 @@ class Trends:
             "changes": [change_of(*ends, i) for i in range(len(PARAMETERS))],
             "budget": {source: [u[i] for i in MAIN] for source, u in ends[1].get("budget", {}).items()},
             "held_utc_ns": _lasting(statuses),
-            "adopted_utc_ns": max((s["t_utc_ns"] for s in statuses if _adopts(s)), default=None),
+            "adopted_utc_ns": max(
+                (t for s in statuses if _adopts(s) and (t := s["t_utc_ns"]) >= accepted), default=None
+            ),
             "certificate_utc_ns": _certificate_since(history),
             "found": {v["parameter"]: _trend(v, from_then, ends) for v in verdicts},
             "beside": self._fleet.beside(place),

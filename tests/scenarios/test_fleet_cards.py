@@ -130,11 +130,15 @@ def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
         for k in range(12):
             take(f"s{k:02}", calibration(1))
             take(f"s{k:02}", status(1, "HELD" if k in (4, 8) else "VALID"))
+        take("s00", calibration(2, sxx=26254.0))
         watched = Watched(browser, served.address, viewport={"width": 1440, "height": 900})
         watched.context.add_init_script(SHIFTS)
         page = watched.open()
         names, asked = page.locator("#cards h3 a"), page.locator("#new-cards")
         page.locator("#cards svg").nth(1).wait_for()
+        large = page.locator("#groups .row", has_text="s00")  # 100 counts, and U of the change is 17
+        large.get_by_text("no verdict").wait_for()
+        assert large.locator(".number").all_inner_texts()[:2] == ["+0.382 %", "5.9 U\nno verdict"]
         take("s02", status(2, "HELD"))
         take("s08", status(2, "VALID"))
         asked.filter(has_text="1 new, 1 over: show").wait_for()

@@ -288,10 +288,13 @@ def test_what_is_held_is_told_beyond_the_calibration_in_force_and_at_once(tmp_pa
 
 def test_when_a_jump_came_into_force(tmp_path: Path) -> None:
     fleet, database = Fleet(), Database(Sqlite(tmp_path / "monitor.sqlite"), full_days=1000)
-    kept = [calibration(1), *(status(k, "RECALIBRATING") for k in (2, 3))]
-    for number, (result, before) in enumerate(zip(kept, ("", "HELD", "RECALIBRATING"), strict=True), start=1):
+    kept = [calibration(1), *(status(k, "RECALIBRATING") for k in (2, 3)), status(4, reason="estimate 7 accepted by a")]
+    trends = Trends(database, fleet)
+    for number, (result, before) in enumerate(zip(kept, ("", "HELD", "RECALIBRATING", "HELD"), strict=True), start=1):
         fields = fields_of(result, before=before)
         database.add([Received("", Address(*PLACE, result.what), number, fields, None)])
         fleet.take(*PLACE, result.what, fields)
-    assert Trends(database, fleet).of(PLACE)["adopted_utc_ns"] == kept[1].t_utc_ns
+        if number == 3:
+            assert trends.of(PLACE)["adopted_utc_ns"] == kept[1].t_utc_ns
+    assert trends.of(PLACE)["adopted_utc_ns"] is None  # changes count from what was accepted later
     database.close()

@@ -3,7 +3,7 @@ import { $, clean, full, get, make, placeOf, table, text, view } from "./common.
 import { ago, AXES, band, day, DAY_NS, finite, moment, now, signed, two } from "./format.js";
 import { card, chip, KINDS, spark, tile } from "./parts.js";
 import { saveTable } from "./picture.js";
-import { cardPlot, certificate, covered, largest, NO_VERDICT, ofDoubled, shortName, stateOf, steps, timeOf, told as toldOf } from "./words.js";
+import { cardPlot, certificate, covered, largest, ofDoubled, shortName, stateOf, steps, timeOf, told as toldOf, unjudged } from "./words.js";
 
 const WORST = ["drifting", "held", "doubled", "changed", "no data", "silent", "uncalibrated", "gateway"]; // the worst first
 const LET_GO_MS = 600000; // after which nobody is taken to look at a page that was not touched, as on a wall
@@ -162,9 +162,9 @@ class Row {
     if (!told.t_utc_ns) return;
     const from = now() - 366 * DAY_NS;
     AXES.forEach((axis, i) => this.cells[axis].replaceChildren(spark(`S${axis}${axis} over a year`, [{ t: told.t_utc_ns, v: told.main_pct[i], tone: axis }], [from, now(), -SCALE_PCT, SCALE_PCT])));
-    const most = largest(told), unjudged = most?.over > 1 && this.row.kind === "sound";
+    const most = largest(told), [why, words] = unjudged(told), allowed = most?.over > 1 && this.row.kind === "sound";
     put(this.cells.change, most ? `${signed(most.pct, most.U)} %` : "");
-    this.cells.over.replaceChildren(...(most ? [text(`${most.over.toFixed(1)} U`), ...(unjudged ? [make("small", "no verdict", { title: NO_VERDICT })] : [])] : []));
+    this.cells.over.replaceChildren(...(most ? [text(`${most.over.toFixed(1)} U`), ...(allowed ? [make("small", why, { title: words })] : [])] : []));
     this.refer();
   }
 

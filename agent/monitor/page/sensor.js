@@ -6,7 +6,7 @@ import { ago, AXES, band, day, finite, MAIN, moment, NAMES, plusMinus, rounded, 
 import { bars, chip, may } from "./parts.js";
 import { savePlots } from "./picture.js";
 import { boxOf, curves, TimePlots } from "./plots.js";
-import { certificate, covered, explanation, NO_VERDICT, shortName, steps, timeOf, told as toldOf } from "./words.js";
+import { certificate, covered, explanation, shortName, steps, timeOf, told as toldOf, unjudged } from "./words.js";
 
 const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
 const KINDS = ["calibration", "window", "drift", "status", "estimate", "clock"];
@@ -101,7 +101,7 @@ function showMatrix(newest, row, trends) {
   const cell = (i) => {
     const U = 2 * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "", silent = over && Math.abs(change.change) > change.U && !moved.has(NAMES[i]);
     const known = newest.determined[i] ? [] : [make("small", "by the prior")];
-    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(over ? [make("small", `moved ${over}${silent ? ", no verdict" : ""}`, silent ? { title: NO_VERDICT } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
+    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(over ? [make("small", `moved ${over}${silent ? `, ${unjudged(trends)[0]}` : ""}`, silent ? { title: unjudged(trends)[1] } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
   };
   const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
   const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);

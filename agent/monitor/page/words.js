@@ -114,12 +114,12 @@ function heldWords(row, verdicts, trends) {
 // What is said of a sensor that is in order: its largest change of a main sensitivity, and what was adopted.
 function soundWords(row, trends) {
   const most = largest(trends), adopted = trends?.adopted_utc_ns ? [" A jump was adopted on ", day(trends.adopted_utc_ns), "; U has been larger since."] : [];
-  const change = most ? [` Its largest change since ${trends.accepted ? "the accepted" : "the first"} calibration is that of `, symbol(most.name), `: ${signed(most.pct, most.U)} % (± ${two(most.U)} %)`, most.over > 1 ? `, ${NO_VERDICT}.` : "."] : [];
+  const change = most ? [` Its largest change since ${trends.accepted ? "the accepted" : "the first"} calibration is that of `, symbol(most.name), `: ${signed(most.pct, most.U)} % (± ${two(most.U)} %)`, most.over > 1 ? `, ${unjudged(trends)[1]}.` : "."] : [];
   return { say: ["No drift and no step is found.", ...adopted], more: [...change, trends?.beside?.count ? ` ${trends.beside.count} other sensors have the same reference.` : ""] };
 }
 
-// Why a change above its U is no verdict.
-export const NO_VERDICT = "no more than the agent's test lets a sound sensor walk in this time";
+// Why a sensor is in order with a change above its U: [short, in words].
+export const unjudged = (trends) => (trends?.adopted_utc_ns ? ["adopted", "which was adopted"] : ["no verdict", "no more than the agent's test lets a sound sensor walk in this time"]);
 
 // The main sensitivity that has changed most over U of its change: {name, pct, U (both in %), over}.
 export function largest(trends) {
