@@ -41,8 +41,8 @@ class Trends:
         `accepted_utc_ns`; `changes`: of each parameter its change and U of that; `budget`: what makes u of the main
         sensitivities (3), by source; `found`: of each verdict what the history tells; `held_utc_ns`: since when the
         status is what it is; `adopted_utc_ns`: when a jump last came into force since then; `beside`: Fleet.beside.
-        Where the status is HELD also `refused_utc_ns`: when a window since then was not used, thinned; and `estimates`: the
-        newest ones after the calibration in force, each with `t_utc_ns`, `main_pct` (3), `values` and `u` (12).
+        Where the status is HELD also `refused_utc_ns`: when a window since then was not used, thinned; and `estimates`:
+        the newest ones after the calibration in force, each with `t_utc_ns`, `main_pct` (3), `values` and `u` (12).
 
         {} where no calibration is known.
         """

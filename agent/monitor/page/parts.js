@@ -33,7 +33,7 @@ export async function copy(line, code, told) {
 }
 
 export function copier(line) {
-  const told = make("span", "", { role: "status", class: "hint" }), code = make("code", line, { tabindex: "0" });
+  const told = make("span", "", { role: "status", class: "hint" }), code = make("code", line.split(" ").flatMap((word) => [" ", make("span", word)]).slice(1), { tabindex: "0" });
   return make("div", [code, make("button", "Copy", { type: "button", click: () => copy(line, code, told), "aria-label": `Copy: ${line}` }), told], { class: "command" });
 }
 
