@@ -286,7 +286,9 @@ class Fleet:
     def _row_of(self, place: Place) -> dict[str, Any]:
         if place not in self._made:
             gateway = place[:2]
-            heard = place not in self._silent and gateway in self._alive
+            # A sensor without data has no results; of its gateway it is known all the same.
+            lost = self._newest[place].get("status", {}).get("status") == "INVALID"
+            heard = (lost or place not in self._silent) and gateway in self._alive
             doubled = gateway in self._mixed_utc_ns
             of = {"heard_utc_ns": self._heard[place].at_ns, "changed": self._changed[place]}
             row = _row(place, self._newest[place], self._state_of(gateway), heard=heard, doubled=doubled)

@@ -201,6 +201,12 @@ def test_a_sensor_that_misses_three_intervals_is_not_heard() -> None:
     assert row["heard_utc_ns"] == heard
     fleet.take(*PLACE, "status", fields_of(status(9)))
     assert kind(fleet) == "sound"
+    fleet.take(*PLACE, "status", fields_of(status(10, "INVALID")))
+    now.ns += 10_000 * SECOND_NS
+    fleet.look()
+    assert kind(fleet) == "no data"  # a lost sensor has no results, and its gateway is heard
+    fleet.set_alive("site", "gw", False)
+    assert kind(fleet) == "silent"
 
 
 def test_rows_that_have_not_changed_are_not_sent_again_and_events_are_told_once() -> None:

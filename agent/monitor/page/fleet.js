@@ -42,11 +42,11 @@ function showCounts(sensors, kind, go) {
 
 // --- cards
 
-// A card for each sensor, or for a gateway whose sensors are not heard or are mixed with others; the worst first.
+// A card for each sensor, or for a gateway that is not on the bus or whose results are mixed with others; the worst first.
 function needs(sensors, gateways) {
-  const rank = (row) => WORST.indexOf(row.kind), byGateway = ["silent", "doubled"], found = [], kindOf = (gateway) => (gateway.mixed_utc_ns ? "doubled" : "gateway");
-  const silent = Map.groupBy(sensors.filter((row) => row.kind === "silent"), gatewayOf);
-  for (const row of sensors.filter((one) => rank(one) >= 0 && !byGateway.includes(one.kind))) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? 0 });
+  const rank = (row) => WORST.indexOf(row.kind), byGateway = (row) => row.kind === "doubled" || (row.kind === "silent" && row.gateway_state === "silent"), found = [], kindOf = (gateway) => (gateway.mixed_utc_ns ? "doubled" : "gateway");
+  const silent = Map.groupBy(sensors.filter((row) => row.kind === "silent" && byGateway(row)), gatewayOf);
+  for (const row of sensors.filter((one) => rank(one) >= 0 && !byGateway(one))) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? 0 });
   for (const [name, rows] of silent) found.push({ key: `gateway ${name}`, row: rows.reduce((a, b) => ((b.last_good_utc_ns ?? 0) < (a.last_good_utc_ns ?? 0) ? b : a)), rows, rank: WORST.indexOf("silent"), size: rows.length });
   for (const gateway of gateways.filter((g) => g.why && g.alive)) found.push({ key: `state ${gatewayOf(gateway)}`, gateway, kind: kindOf(gateway), rank: WORST.indexOf(kindOf(gateway)), size: 0 });
   return found.sort((a, b) => a.rank - b.rank || b.size - a.size || (a.key < b.key ? -1 : 1));
@@ -62,7 +62,7 @@ function drawn({ row, rows, gateway, kind }) {
   const found = trends.get(full(row))?.told, { say, more } = toldOf(row, found), usable = covered(row, found);
   if (rows) {
     const moved = rows.filter((one) => one.verdicts.length).map((one) => one.sensor), names = rows.slice(0, 6).map((one) => one.sensor).join(", ");
-    return card({ kind: "silent", name: `gateway ${gatewayOf(row)}`, where: `${rows.length} sensors: ${names}${rows.length > 6 ? ", …" : ""}`, say, usable, more: moved.length ? `Before it fell silent ${moved.slice(0, 6).join(", ")} drifted.` : "Before it fell silent no drift was found.", plot: null, steps: steps(row, found) });
+    return card({ kind: "silent", name: `gateway ${gatewayOf(row)}`, where: `${rows.length} sensors: ${names}${rows.length > 6 ? ", …" : ""}`, say, usable, more: moved.length ? `Before it fell silent ${moved.slice(0, 6).join(", ")} had changed.` : "Before it fell silent no drift was found.", plot: null, steps: steps(row, found) });
   }
   const name = make("a", `${clean(row.gateway)} / ${clean(row.sensor)}`, { href: `#${placeOf(row)}` });
   return card({ kind: row.kind, name, where: `${clean(row.site)}${row.reference ? `, reference ${clean(row.reference)}` : ""}`, say, usable, more, plot: cardPlot(row, found), steps: steps(row, found) });

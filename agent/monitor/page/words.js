@@ -133,7 +133,7 @@ export function told(row, trends) {
   const verdicts = row.verdicts.map((v) => sentence(v, trends?.found?.[v.parameter]));
   const reason = row.reason ? [row.reason, "."] : [], since = trends?.held_utc_ns ?? row.status_utc_ns;
   const newest = row.heard_utc_ns - row.result_utc_ns > DAY_NS ? ["; its newest result is of ", day(row.result_utc_ns)] : [];
-  if (row.kind === "silent") return { say: ["Not heard since ", make("b", moment(row.heard_utc_ns)), ` (${duration(now() - row.heard_utc_ns)})`, ...newest, "."], more: verdicts.flatMap((v) => ["Before: ", ...v, " "]) };
+  if (row.kind === "silent") return { say: ["Not heard since ", make("b", moment(row.heard_utc_ns)), ` (${duration(now() - row.heard_utc_ns)}${row.gateway_state === "silent" ? "" : ", though its gateway is on the bus"})`, ...newest, "."], more: verdicts.flatMap((v) => ["Before: ", ...v, " "]) };
   if (row.kind === "doubled") return { say: ["Two gateways have this name, and their results are mixed."], more: verdicts.flatMap((v) => ["One of them: ", ...v, " "]) };
   if (row.kind === "held") return heldWords(row, verdicts, trends);
   if (verdicts.length) return { say: verdicts.flatMap((v) => [...v, " "]), more: [often(row.verdicts[0]), " ", ...steady(row), cause(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
