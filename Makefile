@@ -49,8 +49,8 @@ test test-thorough: export FIELDCAL_CONTRACT_SAMPLES = 90000
 test: $(VENV)/development  ## before a merge: what decides whether results, uncertainties, recordings and the program are right
 	$(call tested,$(PROCESSES),-m "not faults and not thorough") || $(call once_more,-m "not faults and not thorough")
 
-# The drivers' contract reads 5,000 samples here.
-test-quick: export FIELDCAL_CONTRACT_SAMPLES = 5000
+# The drivers' contract reads 1,000 samples here.
+test-quick: export FIELDCAL_CONTRACT_SAMPLES = 1000
 test-quick: $(VENV)/development  ## before a commit: modules, properties and drivers, in a minute and a half
 	$(call tested,$$(nproc),-m "not faults and not thorough and not slow" tests/unit tests/properties tests/contract)
 

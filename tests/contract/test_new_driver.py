@@ -15,6 +15,7 @@ from agent.cli.main import run_cli
 from tests.scenarios.processes import ROOT
 
 
+@pytest.mark.slow
 def test_its_own_tests_pass(tmp_path: Path) -> None:
     package = tmp_path / "my-imu"
     assert run_cli(["new-driver", "my-imu", "--output", str(package)]) == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,6 +81,7 @@ def test_the_order_of_windows_does_not_matter(seed, random):
     np.testing.assert_allclose(np.sqrt(np.diag(other.covariance)[:12]), u, rtol=1e-6)
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=SEEDS)
 def test_more_of_the_same_data_never_widens_type_a(seed):
@@ -94,6 +96,7 @@ def test_more_of_the_same_data_never_widens_type_a(seed):
     assert twice.contributions["alpha by position"].max() > 0.9 * largest
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=SEEDS, factor=st.floats(1.5, 10.0))
 def test_wider_priors_never_narrow_the_result(seed, factor):

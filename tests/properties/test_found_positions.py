@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -40,6 +41,7 @@ def turned(seed: int, *, free: bool) -> Iterator[Event]:
             yield event
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1), free=st.booleans())
 @example(seed=1, free=False)
@@ -57,6 +59,7 @@ def test_restored_at_any_event_it_goes_on_alike(seed: int, free: bool) -> None:
     assert restored.snapshot() == going_on.snapshot()
 
 
+@pytest.mark.slow
 def test_the_happenings_hold_positions_that_are_found_and_some_that_are_not() -> None:
     """Without them the property above would say little."""
     for free in (False, True):

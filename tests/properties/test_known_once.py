@@ -192,6 +192,7 @@ HAPPENINGS = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(
     max_examples=25,
     deadline=None,
@@ -223,6 +224,7 @@ def test_what_is_stated_while_a_reference_is_away_holds_when_it_comes_back() -> 
     assert found.max() <= 1.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [1, 2, 4, 8])
 def test_changed_uncertainties_of_one_reference_are_no_new_reference(changes: int) -> None:
     life = begun(5)

@@ -703,7 +703,10 @@ def motion_along_an_axis_that_tells_nothing(draw: Drawn) -> World:
     return World("S", each("Sxy", "Syy", "Szy"), [record], values(S, Q), u, more={"held_mps2": np.zeros(3)})
 
 
-@pytest.mark.parametrize("name", CASES)
+SOME_AT_ONCE = [pytest.param(name, marks=pytest.mark.slow if k % 6 else ()) for k, name in enumerate(CASES)]
+
+
+@pytest.mark.parametrize("name", SOME_AT_ONCE)
 def test_what_is_stated_is_what_the_error_is(name: str) -> None:
     world, draws = CASES[name], Drawn()
     own = world(draws)

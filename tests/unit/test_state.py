@@ -156,6 +156,7 @@ def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better(window
     assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 2 * 1.1e-3
 
 
+@pytest.mark.slow
 def test_nor_by_motion_askew_to_its_channels() -> None:
     """Which way it goes was measured by two channels, each with its own error: their ratio is no third standard."""
     random, found = np.random.default_rng(12), mounted(replace(FIXED, reference=1e-3))
@@ -179,6 +180,7 @@ def test_wandering_never_makes_less_known_than_before_any_data() -> None:
     assert u[4] < U[4]
 
 
+@pytest.mark.slow
 def test_temperature_is_told_from_drift() -> None:
     random = np.random.default_rng(6)
     model = TemperatureModel(offset_order=1, sensitivity_order=1, u_offset_mps2=(0.05, 1e-3), u_sensitivity=1e-3)
@@ -226,6 +228,7 @@ def test_a_window_without_a_temperature_may_have_had_any_of_those_before() -> No
     np.testing.assert_allclose(moved, 0.0, atol=2e-3)  # 80 to 240 mm/s2 would be taking 28 degC for 20
 
 
+@pytest.mark.slow
 def test_the_innovation_is_chi_squared_and_each_score_normal() -> None:
     scores, statistics, freedom = [], [], 0
     for seed in range(40):
@@ -261,6 +264,7 @@ def test_a_change_moves_a_score_by_what_the_information_says() -> None:
     assert np.isnan(told[0].score[[0, 2]]).all()  # these columns were not excited
 
 
+@pytest.mark.slow
 def test_a_snapshot_goes_on_bit_for_bit() -> None:
     random = np.random.default_rng(9)
     records = [Record.of(building_window(random), k / 24, 1e-4, 20.0 + k) for k in range(8)]
@@ -294,6 +298,7 @@ def test_an_operators_calibration_is_where_it_goes_on_from() -> None:
     assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 3e-3
 
 
+@pytest.mark.slow
 def test_accepted_again_and_again_it_is_known_no_better() -> None:
     # The reference's 0.1 % is in S: were it met as a new one after each accept, u(S_yy) were 0.03 % after six.
     random, found = np.random.default_rng(12), mounted(replace(FIXED, reference=1e-3))

@@ -50,6 +50,7 @@ def turned_by_hand(response: Filter, shaken_mps2: float, one_in: int, **stated: 
 STATED = {"sensor_filter": "lowpass order=2 corner_hz=9", "reference_filter": "flat"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("response", "stated", "shaken_mps2", "one_in"),
     [
@@ -72,6 +73,7 @@ def test_s_at_0_hz_is_told_by_rests_alone(
     assert "S holds at 0 Hz, told by rests alone" in found.where_it_holds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("response", "shaken_mps2"),
     [
@@ -93,6 +95,7 @@ def test_one_tone_in_all_stays_tells_s_at_its_frequency(response: Filter, shaken
     assert np.all(away < 4.0 * found.standard_uncertainty[:9])
 
 
+@pytest.mark.slow
 def test_a_reversed_reference_is_no_lag_of_half_a_period() -> None:
     """Half a period later, a tone of the other sign fits as well: what is refused for its sign stays refused."""
     random = np.random.default_rng(16)
@@ -124,6 +127,7 @@ def test_two_tones_tell_s_at_their_mean_frequency_by_power() -> None:
     assert found.reference_frequency_hz == pytest.approx(np.sqrt((6.4**2 + 8.3**2) / 2.0), rel=0.02)
 
 
+@pytest.mark.slow
 def test_s_at_a_stated_frequency_stays_there() -> None:
     found, _ = turned_by_hand(lowpass(1, 100.0), 0.2, 5, reference_frequency_hz=TONE_HZ)
     assert found.reference_frequency_hz == TONE_HZ
@@ -203,6 +207,7 @@ def test_a_response_that_noise_makes_up_is_refused_with_a_remedy_that_works() ->
     assert np.all(away < found.expanded_uncertainty[:9])
 
 
+@pytest.mark.slow
 def test_the_remedy_is_not_named_where_it_would_not_work() -> None:
     """A resonance within the motion is no flat filter."""
     made = pair(3, lambda f: 1.0 / (1.0 - (f / 4.0) ** 2 + 0.1j * f / 4.0))

@@ -65,6 +65,7 @@ def peak(windows: Sequence[Window], priors: Priors) -> int:
     return tracemalloc.get_traced_memory()[1] - before
 
 
+@pytest.mark.slow
 def test_an_adjustment_needs_less_memory_than_its_windows() -> None:
     windows = made(4)
     band_hz = motion_band_hz(windows)

@@ -458,6 +458,7 @@ def test_the_sound_ones_are_good(sound: str, tmp_path: Path, capsys: pytest.Capt
     assert (status, good) == (0, True), said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SYNTAX, *VALUES, *PLANS, *DOUBTED, *WARNED])
 def test_a_mistake_is_told_and_its_remedy_makes_the_file_good(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -528,6 +529,7 @@ def test_a_wrong_command_line_is_told_and_nothing_runs(
     assert [path.name for path in tmp_path.iterdir()] == ["gateway.toml"]
 
 
+@pytest.mark.slow
 def test_a_run_says_what_cannot_calibrate_and_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "gateway.toml"
     path.write_text(PLANS["two alphas"].sound.replace(THIRD, FIRST))
