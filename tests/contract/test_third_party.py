@@ -16,7 +16,7 @@ PACKAGE = ROOT / "examples" / "fieldcal-mma8451"
 PAGE = ROOT / "docs" / "add-a-sensor.md"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_its_own_tests_pass(tmp_path: Path) -> None:
     project = tomllib.loads((PACKAGE / "pyproject.toml").read_text("utf-8"))["project"]
     info = tmp_path / "fieldcal_mma8451-0.1.0.dist-info"

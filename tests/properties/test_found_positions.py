@@ -42,7 +42,7 @@ def turned(seed: int, *, free: bool) -> Iterator[Event]:
 
 
 @pytest.mark.slow
-@settings(max_examples=8)
+@settings(max_examples=2)
 @given(seed=st.integers(0, 2**32 - 1), free=st.booleans())
 @example(seed=1, free=False)
 @example(seed=1, free=True)
@@ -59,7 +59,7 @@ def test_restored_at_any_event_it_goes_on_alike(seed: int, free: bool) -> None:
     assert restored.snapshot() == going_on.snapshot()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_happenings_hold_positions_that_are_found_and_some_that_are_not() -> None:
     """Without them the property above would say little."""
     for free in (False, True):

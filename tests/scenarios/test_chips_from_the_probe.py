@@ -89,9 +89,9 @@ def plugged(chip: Chip) -> Iterator[tuple[Bench, UmockdevSite, PtyDevice]]:
     port.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.skipif(ABSENCE is not None, reason=str(ABSENCE))
-@pytest.mark.parametrize("name", ["lis3dh", *(pytest.param(k, marks=pytest.mark.thorough) for k in list(CHIPS)[1:])])
+@pytest.mark.parametrize("name", list(CHIPS))
 def test_a_chip_becomes_valid(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chip = CHIPS[name]
     data_dir, config, output = tmp_path / "data", tmp_path / "gateway.toml", tmp_path / "output"

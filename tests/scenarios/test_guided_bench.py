@@ -22,7 +22,7 @@ def _errors_over_u(output: Path, kind: str, seed: int) -> np.ndarray:
     return (np.array(found["sensitivity"]) - truth) / np.array(found["expanded_uncertainty"]["sensitivity"])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_clamp_with_a_wrong_turn(tmp_path):
     """The wrong turn is noticed with its name; turned right, the session ends where it was wanted, and S is right."""
     wrong = iter(["", "hand 35 60"])

@@ -33,6 +33,7 @@ def test_the_band_is_the_binomial_one() -> None:
     assert probability[2] < 0.1  # and so does one whose U is far too large
 
 
+@pytest.mark.thorough
 def test_motion_ahead_of_the_main_motion_on_the_other_axes_contradicts_nothing() -> None:
     """0.5 to 1 % of the motion along y appears along x and z, at any phase: all windows are taken.
 

@@ -18,6 +18,7 @@ def test_a_drift_of_ten_percent_a_year_is_told_and_covered(seed: int) -> None:
     assert (run.beyond, run.held) == (0, 0)
 
 
+@pytest.mark.thorough
 def test_without_a_drift_nothing_is_told() -> None:
     run = drifting.one(drifting.SEED, 0.0, TIMING)
     assert (run.found, run.beyond, run.held) == ([], 0, 0)

@@ -14,6 +14,7 @@ from benchmarks.online import year
 from benchmarks.online.year import Year
 from hw.virtual.building import DAY_S, Building
 
+pytestmark = pytest.mark.thorough  # half a minute; `test_online_drift.py` stays in `make test`
 DAYS = range(105, 195)  # the step is on day 150
 SEED = 1
 
@@ -27,8 +28,7 @@ def followed(elsewhere: float) -> Year:
     return year.whole(world(elsewhere), DAYS)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("elsewhere", [0.0, pytest.param(0.3, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("elsewhere", [0.0, 0.3])
 def test_a_step_of_one_per_cent_is_found_and_followed(elsewhere: float) -> None:
     building, seen = world(elsewhere), followed(elsewhere)
     found = seen.step_found_after(building)
@@ -43,7 +43,7 @@ def test_a_step_of_one_per_cent_is_found_and_followed(elsewhere: float) -> None:
     assert seen.alarms_before() == []
 
 
-@pytest.mark.parametrize("elsewhere", [0.0, pytest.param(0.3, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("elsewhere", [0.0, 0.3])
 def test_the_mean_output_is_right_and_q_within_its_uncertainty(elsewhere: float) -> None:
     seen = followed(elsewhere)
     assert np.abs(seen.mean_error_mps2).max() < 2e-3
@@ -58,7 +58,6 @@ def test_what_was_not_excited_stays_as_it_was() -> None:
     assert np.abs(columns - columns[0]).max() < 1e-12
 
 
-@pytest.mark.thorough
 def test_with_other_motion_the_other_columns_change() -> None:
     assert np.abs(np.array(followed(0.3).columns) - followed(0.0).columns[0]).max() > 1e-3
     assert min(followed(0.3).u_syy) > 0.7e-3

@@ -143,7 +143,7 @@ def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest
     assert calibrated(with_it, *own) == calibrated(without, *own) != stated
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_calibrate_uses_the_filters_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with_them, without = recorded(tmp_path / "a", STATED), recorded(tmp_path / "b", {})
     options = ["--sensor-filter", NEAR_TEXT[0], "--reference-filter", "flat"]

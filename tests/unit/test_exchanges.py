@@ -88,7 +88,7 @@ def test_another_range_is_named_at_once_and_both_that_is_advised_ends_it() -> No
     assert u[[0, 4, 8]].max() < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_sensor_that_was_turned_on_its_mount_goes_on_with_the_rotation_that_is_advised() -> None:
     turned = Exchange(QUARTER, "mount")
     found, told = held(*[turned] * HELD)

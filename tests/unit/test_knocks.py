@@ -24,7 +24,7 @@ def rms(outcomes: list[Outcome]) -> float:
     return float(np.sqrt(np.mean([main_errors_pct(found) ** 2 for found in outcomes])))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_bench_with_knocks_is_as_good_as_without() -> None:
     """One knock of 20 ms a second, behind a clock that is 1.3 % off and stamps in batches of 32 with 2 ms of jitter.
 

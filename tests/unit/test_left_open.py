@@ -220,6 +220,7 @@ def test_corners_that_differ_explain_deviations_of_bands() -> None:
     assert BetweenBands(shift=0.5 * found.explains).beyond(found.explains) == 0.5 * found.explains
 
 
+@pytest.mark.thorough
 @SEEDS
 def test_deviations_that_axes_explain_do_not_count_twice(seeds: int) -> None:
     """Filters of order 4 near the motion: bands deviate by 0.1 %, S of an axis is off by a sixth of that, and u says

@@ -39,20 +39,18 @@ def _one_thread_of_arrow(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ending", ["parquet", pytest.param("csv", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("ending", ["parquet", "csv"])
 def test_calibrate_from_files(ending: str, tmp_path: Path) -> None:
     assert grew([calibrated(*WRITERS[ending](tmp_path, n, 1), n) for n in LENGTHS_MIN]) < MOST_GROWTH_MB
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_calibrate_from_a_recording(recordings: list[Path]) -> None:
     peaks_mb = [calibrated(path, path, count) for path, count in zip(recordings, LENGTHS_MIN, strict=True)]
     assert grew(peaks_mb) < MOST_GROWTH_MB
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("ending", ["parquet", "mcap"])
 def test_export(ending: str, recordings: list[Path], tmp_path: Path) -> None:

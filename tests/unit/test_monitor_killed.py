@@ -37,7 +37,7 @@ def kept(engine: Engine) -> list[int]:
         return [sequence for (sequence,) in run("SELECT sequence FROM result ORDER BY number")]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 def test_a_killed_monitor_loses_nothing_and_keeps_nothing_twice(site: Site, tmp_path: Path, url: str | None) -> None:
     settings = tmp_path / "monitor.toml"
     settings.write_text("" if url is None else f'[database]\nurl = "{url}"\n')

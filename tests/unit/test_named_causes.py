@@ -253,7 +253,7 @@ def test_what_the_next_tests_are_told_to_do_is_accepted() -> None:
 @pytest.mark.parametrize(
     ("divided_by", "multiply", "told"),
     [
-        pytest.param(G_MPS2, "9.807", "it is in g", marks=pytest.mark.slow),
+        pytest.param(G_MPS2, "9.807", "it is in g", marks=pytest.mark.thorough),
         pytest.param(0.001, "0.001", "it is in mm/s2", marks=pytest.mark.thorough),
     ],
 )

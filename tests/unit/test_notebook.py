@@ -248,7 +248,7 @@ def test_what_a_notebook_shows_is_escaped_and_has_no_colours_of_its_own(result: 
     assert "background" not in result._repr_html_()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_print_shows_fits_a_screen_and_is_what_the_command_prints(
     result: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,7 +17,7 @@ from tests.scenarios.processes import ROOT
 GOLDEN = ROOT / "tests" / "replay" / "golden"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_files_are_worked_on_everywhere(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the figures need the extra `report`")
     example, data = tmp_path / "example", tmp_path / "data"

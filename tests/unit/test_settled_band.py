@@ -168,7 +168,7 @@ def test_a_stated_band_is_used_from_the_first_window_on_and_can_be_stated_later(
         assert judged(found)[0] < 1.05
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_lorries_in_the_first_window_do_not_matter_on_line() -> None:
     """With the band of the first window for life, u was 1.26 times the bound with these samples."""
     found = lorries.one(("the first", lorries.SEED + 2))

@@ -225,7 +225,7 @@ def test_an_invalid_endpoint_is_bad_input() -> None:
     assert (done.return_value, "not an endpoint" in done.stderr) == (2, True)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_fleet_in_several_processes_is_the_same_fleet(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,7 +93,7 @@ def test_s_and_q_are_as_uncertain_as_said(jitter_s: float) -> None:
     assert mean_square(as_they_are(jitter_s)).max() < highest
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_weighed_as_exact_they_would_not_be(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adjustment, "SCATTER_TURNS", 0)
     assert mean_square(drawn(100e-6)).max() > 4.0

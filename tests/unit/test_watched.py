@@ -318,7 +318,7 @@ def test_another_device_begins_anew() -> None:
     assert hours(site.results)[0].samples <= 200 * 200
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_the_mean_was_at_the_calibration_is_known_after_a_restart() -> None:
     """A week before the restart, and two days after it with z less by half a per cent."""
     config, kept, sayings = watched_config(prior=PRIOR), dict[str, bytes](), list[str]()
