@@ -80,7 +80,7 @@ def rig(tmp_path: Path) -> Iterator[EpsonRig]:
 
 
 class TestAccelerometer(SerialContract):
-    samples = 100_000  # it shares code with serial-binary, whose test reads more
+    samples = min(SerialContract.samples, 100_000)  # it shares code with serial-binary, whose test reads more
 
     @pytest.fixture
     def rig(self, tmp_path: Path) -> Iterator[EpsonRig]:
@@ -90,7 +90,7 @@ class TestAccelerometer(SerialContract):
 
 
 class TestVibrationSensor(SerialContract):
-    samples = 100_000
+    samples = min(SerialContract.samples, 100_000)
 
     @pytest.fixture
     def rig(self, tmp_path: Path) -> Iterator[VelocityRig]:

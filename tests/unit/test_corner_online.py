@@ -53,7 +53,7 @@ def test_a_corner_as_uncertain_as_stated_calibrates(of: str, bench: bool) -> Non
 
 # Of a sensor's corner what is left is second order: the product of the corner and of how far it is off, over the square
 # of the frequency at which S holds: 0.05 % here.
-@pytest.mark.one_case
+@pytest.mark.thorough
 @pytest.mark.parametrize(("of", "apart"), [("reference", 0.1), ("sensor", 0.6)])
 def test_the_result_is_that_of_instruments_without_a_corner(of: str, apart: float) -> None:
     with_corner = errors(Recording(4, drawn(4, of), bench=False), **SECTIONS[of])
@@ -61,7 +61,7 @@ def test_the_result_is_that_of_instruments_without_a_corner(of: str, apart: floa
     assert np.abs(with_corner - without).max() < apart
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_reference_with_gaps_has_an_integral_between_each_two_of_them() -> None:
     devices = drawn(4, "reference")
     whole = errors(Recording(4, devices, bench=False), **SECTIONS["reference"])
@@ -69,7 +69,7 @@ def test_a_reference_with_gaps_has_an_integral_between_each_two_of_them() -> Non
     assert np.abs(with_gaps - whole).max() < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_velocity_reference_has_one_too() -> None:
     drawings = [drawn(k, "reference", derivatives=1, reference_noise=1e-5) for k in range(2)]
     stated = {"certificate": STATED | {"quantity": "velocity"}}

@@ -165,7 +165,7 @@ def test_the_delay_of_the_drift_test() -> None:
         assert_same(shown, f"| {name} | {' | '.join(f'{mean:.1f}' for mean in means)} |")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_false_alarms_of_the_drift_test() -> None:
     page, windows = (ROOT / "docs/online.md").read_text("utf-8"), 1_200_000
     expected = windows * false_alarm_rate(8.0, FEWEST, SPAN)
@@ -186,7 +186,7 @@ def figures(name: str, begin: str) -> list[list[float]]:
     return [[float(number) for number in NUMBER.findall(cell)] for cell in line.split(" | ")[1:]]
 
 
-@pytest.mark.one_case
+@pytest.mark.thorough
 @pytest.mark.parametrize("row", ["sensor lags by 5 ms", "offset differs by 0.05", "all together"])
 def test_plain_method_3_against_the_adjustment(row: str) -> None:
     number = next(k for k, each in enumerate(torture.ROWS) if each.name.startswith(row))

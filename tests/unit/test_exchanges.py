@@ -125,7 +125,7 @@ def test_what_is_no_exchange_is_not_called_one(matrix: Array) -> None:
     assert explained(again(before()), np.random.default_rng(7), Exchange(matrix), count=2) == []
 
 
-@pytest.mark.one_case
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("cause", "words", "not_advised"),
     [

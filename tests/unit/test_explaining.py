@@ -88,7 +88,7 @@ def test_a_mount_that_leans_is_named_for_as_long_as_its_windows_are_held() -> No
     assert (contradicted[0], contradicted[-1]) == (True, False)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_either_of_two_that_fit_alike_is_named() -> None:
     [told] = [s for s in statuses(Transformed("sensor", "sensor", np.diag([1.0, 1.08, 1.0]))) if s.before == "HELD"]
     assert "another reference sensitivity (reference_y -7" in told.reason

@@ -22,7 +22,7 @@ def hum(random: np.random.Generator, t: Array) -> Array:
     return np.asarray(sum(parts))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_hum_in_both_devices_costs_no_window() -> None:
     """Without the filter no window of these is taken: the response does not settle, or the window contradicts."""
     made, random = Recording(1, DEVICES, bench=False), np.random.default_rng(9)

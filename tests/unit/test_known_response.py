@@ -69,7 +69,7 @@ def test_a_stated_filter_of_which_the_corner_is_a_tenth_off(order: int, in_refer
     assert found.lag_s == pytest.approx(without.lag_s, abs=2e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_filter_whose_corner_is_within_the_motion_is_right_only_if_it_is_stated() -> None:
     response, known = lowpass(4, 16.1), known_of(["lowpass order=4 corner_hz=16 u_corner_pct=1"], ["flat"])
     made, found = recorded(2, response, known)

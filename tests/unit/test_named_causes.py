@@ -313,7 +313,7 @@ def test_a_dead_channel_of_the_reference_is_named_and_no_output_called_dead(chan
     assert not any(reason.startswith("output ") for reason in found.reasons)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_dead_channel_is_found_behind_a_rotation() -> None:
     sensor, (t, a) = triad(turn=QUARTER_TURN)
     dead = a.copy()

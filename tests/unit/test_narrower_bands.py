@@ -101,7 +101,7 @@ def notched(frequency_hz: np.ndarray) -> Complex:  # type: ignore[type-arg]
     return np.asarray(1.0 - 0.3 * np.exp(-0.5 * ((frequency_hz - 6.0) / 0.3) ** 2) + 0j)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_notch_just_above_the_narrower_band_does_not_bend_s() -> None:
     """Limited to 5.4 Hz the bands deviate by less than 0.1 % from one response, and S is 0.2 % off (7 u): 3.8 Hz shows
     it."""

@@ -60,7 +60,7 @@ def _u_main(lag_s: float) -> float:
     return float(found.standard_uncertainty[[0, 4, 8]].max())
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_known_filter_is_no_unknown_of_one_frequency(order: int) -> None:
     """First order at 31 Hz attenuates 6 Hz by 1.8 %; with the filter stated, u is hardly larger than without one."""

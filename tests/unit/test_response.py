@@ -138,7 +138,7 @@ def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
     assert not_limited(pair(3, response)).reasons
 
 
-@pytest.mark.one_case
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [2, 3, 4, 17])
 def test_a_resonance_of_the_reference_within_slow_motion_is_refused(seed: int) -> None:
     """Once a response is taken out, less than four thirds of an octave move: no band was seen any more, S was told as a

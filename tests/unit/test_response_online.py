@@ -103,7 +103,7 @@ def test_the_response_is_told_by_frequency(name):
         assert (np.diag(band.standard_uncertainty) < 0.0025).all()  # a filter changes these by up to 8 %
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_s_means_the_same_when_the_motion_becomes_wider():
     name = "low-pass of order 1, 31 Hz"
     drawn, calm = filtered(FILTERS[name], Band(0.5, 6.0))

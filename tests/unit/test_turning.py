@@ -13,7 +13,7 @@ from calib.estimate.nuisances import Priors
 from tests.clamp_windows import clamp_points
 
 
-@pytest.mark.one_case
+@pytest.mark.thorough
 @pytest.mark.parametrize("axes", [1, 2, 3])
 def test_slow_turning(axes: int) -> None:
     """To and fro, without a stop, and in steps; before, some of these ended with LinAlgError."""
