@@ -58,7 +58,7 @@ class WitMotionRig(SerialRig):
 
 
 class TestWitMotion(SerialContract):
-    samples = min(SerialContract.samples, 100_000)  # two frames per sample; it shares code with serial-binary, whose test reads more
+    samples = min(SerialContract.samples, 100_000)  # two frames a sample; it shares code with serial-binary
 
     @pytest.fixture
     def rig(self, tmp_path: Path) -> Iterator[WitMotionRig]:
