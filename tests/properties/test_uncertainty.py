@@ -703,7 +703,7 @@ def motion_along_an_axis_that_tells_nothing(draw: Drawn) -> World:
     return World("S", each("Sxy", "Syy", "Szy"), [record], values(S, Q), u, more={"held_mps2": np.zeros(3)})
 
 
-SOME_AT_ONCE = [pytest.param(name, marks=pytest.mark.slow if k % 6 else ()) for k, name in enumerate(CASES)]
+SOME_AT_ONCE = [pytest.param(name, marks=pytest.mark.slow if k % 12 else ()) for k, name in enumerate(CASES)]
 
 
 @pytest.mark.parametrize("name", SOME_AT_ONCE)
