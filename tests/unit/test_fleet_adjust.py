@@ -121,6 +121,7 @@ def test_the_reference_that_contradicts_the_others_is_named(
     assert "most suspect: ref 3" in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "by", "fault"),
     [

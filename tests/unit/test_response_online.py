@@ -88,6 +88,7 @@ def test_a_filter_of_the_reference_acts_the_other_way():
     assert deviation_pct(found, np.array(without.sensitivity) / size(name, found)) < SAME_PCT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(FILTERS))
 def test_the_response_is_told_by_frequency(name):
     found = told(name)
