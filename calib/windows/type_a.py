@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
+from calib.signal.order_statistics import distinct
 from calib.windows.sums import NOISE_FLOOR
 
 Scores = tuple[NDArray[np.bool_], Array]  # flags (D,) of the dimensions that windows have, and their scores (W, K, D)
@@ -130,11 +131,11 @@ def _noise(part: Segments, slopes: Array, root: Array) -> Array:
 def _with_data(score: Array, live: NDArray[np.bool_]) -> list[Scores]:
     """Scores (W, K, 2M, 3) of the slopes with data, of which `live` (W, 2M) tells. A window at rest has none, and tells
     nothing of their scatter."""
-    found = list[Scores]()
-    for which in np.unique(live, axis=0):
-        if which.any():
-            own = score[(live == which).all(axis=1)][:, :, which]
-            found.append((np.repeat(which, 3), own.reshape(*own.shape[:2], -1)))
+    found, pattern = list[Scores](), live @ 2.0 ** np.arange(live.shape[1])
+    for alike in (pattern == each for each in distinct(pattern) if each):
+        which = live[alike][0]
+        own = score[alike][:, :, which]
+        found.append((np.repeat(which, 3), own.reshape(*own.shape[:2], -1)))
     return found
 
 
