@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
@@ -24,7 +25,7 @@ from agent.cli.kernels import compute_as_in
 from agent.delivery.history import StoreError
 from agent.recording.chain import Link, chain_faults, missing_after, unproven
 from agent.recording.comparison import OTHER_CPU
-from agent.recording.end_check import check_end
+from agent.recording.end_check import End, check_end
 from agent.recording.gone import Gone, find_gone
 from agent.recording.head import HEAD_NAME
 from agent.recording.reading import open_recording
@@ -126,6 +127,29 @@ def _known(public_key: Path | None, known_keys: Path | None) -> KnownKeys | None
     return replace(listed, anywhere=anywhere)
 
 
+def _is_signed(links: Sequence[Link]) -> bool:
+    """Whether the newest recording is."""
+    return bool(links) and links[-1].signed_results is not None
+
+
+def _print(audited: Sequence[AuditedFile], end: End, lost: str) -> None:
+    for file in audited:
+        for line in describe(file):
+            say(line)
+    if lost:
+        say(f"FAILED: {lost}")
+    for line in end.describe():
+        say(line)
+
+
+def _unproven(audited: Sequence[AuditedFile], keys: KnownKeys | None) -> list[str]:
+    """What files cannot prove without keys, or where they were left open."""
+    if keys is None:
+        return [NO_ENGINE] if audited else []
+    left_open = sum(file.repaired for file in audited)
+    return [OPEN_AFTER_CRASH.format(left_open)] if left_open else []
+
+
 def run_audit(
     given: Given,
     engines: Engines,
@@ -144,32 +168,29 @@ def run_audit(
     except OSError as error:
         say(f"{error.filename}: {error.strerror}", err=True)
         return 2
-    if strict and keys is not None and not given.heads and links[-1:] and links[-1].signed_results is not None:
+    if strict and keys is not None and not given.heads and _is_signed(links):
         end.reasons.append(f"there is no {HEAD_NAME} beside signed recordings, and none was given (--head, --witness)")
-    if keys is None and audited:
-        end.unproven.append(NO_ENGINE)
-    if keys is not None and (left_open := sum(file.repaired for file in audited)):
-        end.unproven.append(OPEN_AFTER_CRASH.format(left_open))
+    end.unproven += _unproven(audited, keys)
     lost = missing_after(links, given.up_to or 0)
     failed = bool(lost or end.reasons or any(file.reasons for file in audited))
     undecided = sum(bool(file.undecided) for file in audited)
     if as_json:
-        counted = {
-            "undecidable": sum(file.replay.undecidable for file in audited),
-            "undecided": undecided,
-            "unsealed": sum(file.repaired for file in audited),
-        }
-        verdict = {"ok": not failed and not undecided, **counted, "missing": lost, "end": end, "files": audited}
-        click.echo(msgspec.json.encode(verdict).decode())
+        click.echo(msgspec.json.encode(_as_object(audited, end, lost, ok=not failed and not undecided)).decode())
     else:
-        for file in audited:
-            for line in describe(file):
-                say(line)
-        if lost:
-            say(f"FAILED: {lost}")
-        for line in end.describe():
-            say(line)
+        _print(audited, end, lost)
     return 3 if failed else 4 if undecided else 0
+
+
+def _as_object(audited: Sequence[AuditedFile], end: End, lost: str, *, ok: bool) -> dict[str, Any]:
+    return {
+        "ok": ok,
+        "undecidable": sum(file.replay.undecidable for file in audited),
+        "undecided": sum(bool(file.undecided) for file in audited),
+        "unsealed": sum(file.repaired for file in audited),
+        "missing": lost,
+        "end": end,
+        "files": audited,
+    }
 
 
 def audit_files(

@@ -79,28 +79,32 @@ def make(
         if len(material.results) > 1:
             raise MaterialError("a certificate is of one result; give one RESULT.json")
         if material.results[0].refused:
-            for reason in material.results[0].reasons:
-                say(f"refused: {reason}", err=True)
-            return 3
+            return _refused(material.results[0].reasons)
         told, text = gather_statements(stated, entries, Asking())
         beside = Path() if stated is None else stated.parent
         written = write(certificate_of(material, told, beside, left_over(material)), output, private, xsd, x509)
         written += _kept(text, output / "certificate.toml", stated)
-    except (ConfigError, KeyFileError, MaterialError, SchemaError) as error:
-        for line in str(error).splitlines():
+    except (ConfigError, KeyFileError, MaterialError, SchemaError, CertificateError, OSError) as error:
+        for line in _worded(error, f"{stated or '--state'}: " if isinstance(error, CertificateError) else "", output):
             say(f"fieldcal certificate: {line}", err=True)
-        return 2
-    except CertificateError as error:
-        say(f"fieldcal certificate: {stated or '--state'}: {error}", err=True)
-        return 2
-    except OSError as error:
-        say(f"fieldcal certificate: {error.filename or output}: {error.strerror}", err=True)
         return 2
     for notice in material.notices:
         say(f"fieldcal certificate: {notice}", err=True)
     for path in written:
         say(str(path))
     return 0
+
+
+def _refused(reasons: Sequence[str]) -> int:
+    for reason in reasons:
+        say(f"refused: {reason}", err=True)
+    return 3
+
+
+def _worded(error: Exception, place: str, output: Path) -> list[str]:
+    if isinstance(error, OSError):
+        return [f"{error.filename or output}: {error.strerror}"]
+    return [f"{place}{error}"] if place else str(error).splitlines()
 
 
 def drawable() -> bool:

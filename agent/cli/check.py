@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import click
 
-from agent.bench.plan_told import shortcomings
+from agent.bench.plan_told import ChannelPlan, shortcomings
 from agent.config import Config, ConfigError
 from agent.config.broker import broker_warning
 from agent.config.faults import shown
@@ -20,7 +21,7 @@ from agent.setup.contradictions import small_uncertainties
 from agent.setup.device_checks import answer_findings, loaded_options, missing_ports, sharing_findings
 from agent.setup.finding import Finding
 from agent.setup.key_checks import signing_key_warnings
-from agent.setup.known_filters import stated_filters
+from agent.setup.known_filters import StatedFilters, stated_filters
 from agent.terminal.quantity import counted
 from agent.terminal.text import say
 
@@ -64,30 +65,53 @@ def check(config: Path, json_to: str | None) -> int:
     unplaced = [told for one in plans for told in one.unplaced]
     doubts = [f"{config}: {shown(place)}: {what}" for place, what in (*unplaced, *small_uncertainties(loaded))]
     warnings += doubts
-    counts = {
-        "devices": len(loaded.devices),
-        "channels": len(loaded.channels),
-        "poses": sum(len(channel.poses) for channel in loaded.channels),
-        "positions": sum(len(channel.stops) for channel in loaded.channels),
-    }
     filters = list(stated_filters(loaded))
     if json_to:
-        watched = [one.sensor for one in plans if one.watched]
-        plans_json = [one.json for one in plans if one.plan is not None]
-        more = {**counts, "filters": [asdict(one) for one in filters], "plans": plans_json, "watched": watched}
+        more = _as_object(loaded, filters, plans)
         click.echo(json.dumps({"good": not doubts, "faults": [], "warnings": warnings, **more}))
         return 0
     for warning in warnings:
         say(warning, err=True)
-    told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]
-    found = ", which the agent finds by gravity" if counts["positions"] else ""
     verdict = "no fault, but what is told of it must be right before `fieldcal run` can calibrate" if doubts else "good"
-    say(f"{config}: {verdict}; {', '.join(told)}{found}")
-    answered = [a.says for a in answers if a.verdict == "good"]
-    planned = [one.told for one in plans if one.told]
-    for line in dict.fromkeys([*planned, *(one.told for one in filters), *answered]):
+    say(f"{config}: {verdict}; {_counted(loaded)}")
+    for line in _details(plans, filters, answers):
         say(f"  {line}")
     return 0
+
+
+def _details(
+    plans: Sequence[ChannelPlan], filters: Sequence[StatedFilters], answers: Sequence[Finding]
+) -> Iterable[str]:
+    """Each line once: what positions determine, which filters are divided out, and what answers."""
+    answered = [a.says for a in answers if a.verdict == "good"]
+    planned = [one.told for one in plans if one.told]
+    return dict.fromkeys([*planned, *(one.told for one in filters), *answered])
+
+
+def _counts(config: Config) -> dict[str, int]:
+    return {
+        "devices": len(config.devices),
+        "channels": len(config.channels),
+        "poses": sum(len(channel.poses) for channel in config.channels),
+        "positions": sum(len(channel.stops) for channel in config.channels),
+    }
+
+
+def _as_object(config: Config, filters: Sequence[StatedFilters], plans: Sequence[ChannelPlan]) -> dict[str, Any]:
+    """What the JSON object tells of a good configuration."""
+    return {
+        **_counts(config),
+        "filters": [asdict(one) for one in filters],
+        "plans": [one.json for one in plans if one.plan is not None],
+        "watched": [one.sensor for one in plans if one.watched],
+    }
+
+
+def _counted(config: Config) -> str:
+    """What a configuration has, in words."""
+    counts = _counts(config)
+    told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]
+    return f"{', '.join(told)}{', which the agent finds by gravity' if counts['positions'] else ''}"
 
 
 def _answers(path: Path, config: Config) -> list[Finding]:

@@ -10,6 +10,7 @@ import click
 
 from agent.cli.data_dir import DATA_DIR
 from agent.cli.finite import Finite
+from agent.cli.rules import check_rules
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -89,16 +90,16 @@ def export(
         _write(recordings, content, to, mcap, rate_hz)
         for why, number in content.left_out.items():
             say(f"fieldcal export: {number} samples have no acceleration: {why}", err=True)
-    except (ExportError, StoreError) as error:
-        say(f"fieldcal export: {error}", err=True)
-        return 2
-    except FileExistsError as error:
-        say(f"fieldcal export: {error.filename}: the file exists; remove it, or choose another name", err=True)
-        return 2
-    except OSError as error:
-        say(f"fieldcal export: {error.filename or to or mcap}: {error.strerror}", err=True)
+    except (ExportError, StoreError, OSError) as error:
+        say(f"fieldcal export: {_worded(error, to or mcap)}", err=True)
         return 2
     return 0
+
+
+def _worded(error: Exception, written: Path | None) -> str:
+    if isinstance(error, FileExistsError):
+        return f"{error.filename}: the file exists; remove it, or choose another name"
+    return f"{error.filename or written}: {error.strerror}" if isinstance(error, OSError) else str(error)
 
 
 def _check(
@@ -106,21 +107,22 @@ def _check(
     corrected: bool,
 ) -> None:  # fmt: skip
     """Raise click.UsageError for options that do not go together."""
-    if to is None and mcap is None:
-        raise click.UsageError("nothing to write; add --to FILE, --mcap FILE, or both")
-    if to is not None and to.suffix not in (*ENDINGS, EPOCHS):
+    ending = None if to is None else to.suffix
+    epochs = ending == EPOCHS
+    if ending not in (None, *ENDINGS, EPOCHS):
         raise click.BadParameter(f"{to}: the ending must be one of {', '.join([*ENDINGS, EPOCHS])}", param_hint="--to")
-    if corrected and (to is None or to.suffix not in (*NUMBERED, EPOCHS) or mcap is not None):
-        endings = " or ".join(NUMBERED)
-        raise click.UsageError(f"--corrected writes one file with the ending {endings}, or {EPOCHS}; name it with -o")
-    if (epochs := to is not None and to.suffix == EPOCHS) and not corrected:
-        raise click.UsageError(f"{to}: StationXML has the epochs of the past; add --corrected")
-    if epochs and place is None:
-        raise click.UsageError("StationXML wants the place of the sensor; add --place LATITUDE LONGITUDE ELEVATION")
-    if place is not None and not epochs:
-        raise click.UsageError(f"--place belongs to StationXML; write a file that ends in {EPOCHS}, or remove --place")
-    if data_dir is not None and not corrected:
-        raise click.UsageError("--data-dir names the windows for --corrected; add that, or remove --data-dir")
+    check_rules(
+        (to is None and mcap is None, "nothing to write; add --to FILE, --mcap FILE, or both"),
+        (corrected and (ending not in (*NUMBERED, EPOCHS) or mcap is not None),
+         f"--corrected writes one file with the ending {' or '.join(NUMBERED)}, or {EPOCHS}; name it with -o"),
+        (epochs and not corrected, f"{to}: StationXML has the epochs of the past; add --corrected"),
+        (epochs and place is None,
+         "StationXML wants the place of the sensor; add --place LATITUDE LONGITUDE ELEVATION"),
+        (place is not None and not epochs,
+         f"--place belongs to StationXML; write a file that ends in {EPOCHS}, or remove --place"),
+        (data_dir is not None and not corrected,
+         "--data-dir names the windows for --corrected; add that, or remove --data-dir"),
+    )  # fmt: skip
 
 
 def _write(recordings: Sequence[Path], content: Content, to: Path | None, mcap: Path | None, rate_hz: float) -> None:

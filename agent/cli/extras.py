@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -44,15 +45,18 @@ def extras(names: tuple[str, ...], wheels: Path | None, index: bool, json_to: st
         found = wheels or (WHEELS if WHEELS.is_dir() else None)
         if not _install([known[name] for name in names], None if index else found):
             return 1
-    parts = optional_parts()
-    if json_to:
+    _list(optional_parts(), as_json=bool(json_to))
+    return 0
+
+
+def _list(parts: Sequence[Extra], *, as_json: bool) -> None:
+    if as_json:
         click.echo(json.dumps({"extras": [asdict(part) | {"installed": part.installed} for part in parts]}))
-        return 0
+        return
     width = max(len(part.name) for part in parts)
     for part in parts:
         state = "installed" if part.installed else "not installed"
         say(f"{part.name.ljust(width)}  {state.ljust(13)}  {part.purpose}")
-    return 0
 
 
 def _install(chosen: list[Extra], wheels: Path | None) -> bool:

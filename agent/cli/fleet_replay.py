@@ -6,12 +6,15 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
 
 from agent.terminal.text import say
+
+if TYPE_CHECKING:
+    from agent.fleet.results import Summary
 
 
 @click.command()
@@ -45,7 +48,7 @@ def replay(
 
     Exit status: 0 all passed, 3 a recording was refused or cannot be read (the others are computed), 2 bad usage.
     """
-    from agent.fleet.results import Summary, results_of
+    from agent.fleet.results import results_of
     from agent.fleet.settings import Setting, SettingError
     from agent.fleet.sources import SourceError, found
     from agent.fleet.workers import DaskWorkers, LocalWorkers, SchedulerError
@@ -64,15 +67,20 @@ def replay(
     except (SourceError, SettingError, SchedulerError) as error:
         say(f"fieldcal fleet replay: {error}", err=True)
         return 2
-    summaries: list[Summary] = []
     where = None if directory is None else directory.absolute()
     with chosen:
         results = results_of(places, settings, chosen, where, audit=with_audit, export=ending or "")
-        for summary in _in_order(places, _shown(results, len(places))):
-            summaries.append(summary)
-            if json_to is None:
-                say(_line(summary))
-    if json_to is not None:
+        return _tell(_in_order(places, _shown(results, len(places))), settings, as_json=json_to is not None)
+
+
+def _tell(results: Iterable[Summary], settings: tuple[str, ...], *, as_json: bool) -> int:
+    """Print a line for each result as it comes, or one JSON object at the end; returns the exit status."""
+    summaries = []
+    for summary in results:
+        summaries.append(summary)
+        if not as_json:
+            say(_line(summary))
+    if as_json:
         click.echo(msgspec.json.encode(_as_object(summaries, settings)).decode())
     return 3 if any(summary.reasons for summary in summaries) else 0
 

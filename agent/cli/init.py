@@ -200,30 +200,38 @@ def _tell_key(pair: KeyPair) -> None:
     say(f"{pair.public}: give this public key to the auditor: fieldcal audit DATA --public-key {pair.public.name}")
 
 
+def _stated_driver(role: Role, given: dict[str, Any]) -> Stated[str]:
+    return Stated(given[role], f"option --{role}") if given[role] else Stated(TEXT_LINES, "default for a port")
+
+
+def _stated_options(role: Role, given: dict[str, Any]) -> dict[str, Stated[Any]]:
+    """The options of a device that are stated on the command line."""
+    stated = driver_options(given[f"{role}_options"], f"--{role}-option")
+    options = {name: Stated(value, f"option --{role}-option") for name, value in stated.items()}
+    if port := given[f"{role}_port"]:
+        options["port"] = Stated(lasting_name(port), f"option --{role}-port {port}")
+    return options
+
+
 def _devices(asking: Asking, given: dict[str, Any]) -> list[Chosen]:
     """The sensor, and the reference if there is one."""
     roles: list[Role] = ["sensor"] if given["no_reference"] or given["mount"] == "rests" else ["sensor", "reference"]
     open_roles = [role for role in roles if not given[role] and not given[f"{role}_port"]]
     found = _found() if open_roles else []
-    used = {lasting_name(port) for role in roles if (port := given[f"{role}_port"])}
+    used = {lasting_name(port) for port in (given[f"{role}_port"] for role in roles) if port}
     chosen = []
     for role in roles:
-        stated = driver_options(given[f"{role}_options"], f"--{role}-option")
-        options = {name: Stated(value, f"option --{role}-option") for name, value in stated.items()}
-        if port := given[f"{role}_port"]:
-            options["port"] = Stated(lasting_name(port), f"option --{role}-port {port}")
+        options = _stated_options(role, given)
         if role not in open_roles:
-            driver, source = given[role] or TEXT_LINES, f"option --{role}" if given[role] else "default for a port"
-            chosen.append(Chosen(role, Stated(driver, source), options))
+            chosen.append(Chosen(role, _stated_driver(role, given), options))
             continue
         candidates = [device for device in found if device.options.get("port") not in used]
         device = _pick(asking, role, candidates)
         if device is not None:
             found.remove(device)
-            options = {
-                name: Stated(value, f"probe: {device.label}") for name, value in device.options.items()
-            } | options
-            chosen.append(Chosen(role, Stated(device.driver, f"probe: {device.label}"), options))
+            source = f"probe: {device.label}"
+            of_probe = {name: Stated(value, source) for name, value in device.options.items()}
+            chosen.append(Chosen(role, Stated(device.driver, source), of_probe | options))
     return chosen
 
 

@@ -118,9 +118,9 @@ def monitor(
             if with_router and not router_running(DEFAULT_ENDPOINT):
                 stack.enter_context(open_router(None)[0])
             data_dir.mkdir(parents=True, exist_ok=True)
-            say(f"the fleet page is at http{'s' if https_certificate else ''}://{listen}")
-            if users is None and not _is_loopback(host):
-                say("anyone who reaches this address can read the page: it has no login (option --users)", err=True)
+            _say_address(
+                listen, https=https_certificate is not None, open_to_all=users is None and not _is_loopback(host)
+            )
             serve(listening, data_dir, bus, web, settings)
         except (ConfigError, EndpointError, KeyFileError, UsersError) as error:
             say(f"fieldcal monitor: {error}", err=True)
@@ -133,6 +133,12 @@ def monitor(
             say(f"fieldcal monitor: {where}: {error}", err=True)
             return 1
     return 0
+
+
+def _say_address(listen: str, *, https: bool, open_to_all: bool) -> None:
+    say(f"the fleet page is at http{'s' if https else ''}://{listen}")
+    if open_to_all:
+        say("anyone who reaches this address can read the page: it has no login (option --users)", err=True)
 
 
 def _add_user(users: Path | None, name: str, verbs: tuple[str, ...]) -> int:

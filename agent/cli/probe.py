@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -100,9 +100,14 @@ def probe(buses: tuple[str | int, ...], driver: str | None, self_test: bool, jso
         click.echo(json.dumps(told))
     else:
         _print(found, selected, ports, named=bool(buses))
-    if buses and (any(bus.fault for bus in found) or any(not one.identity for one in selected)):
+    return _status(found, selected, named=bool(buses))
+
+
+def _status(buses: Sequence[Bus], selected: Sequence[Selected], *, named: bool) -> int:
+    """The exit status; `named`: these buses were asked for by their names."""
+    if named and (any(bus.fault for bus in buses) or not all(one.identity for one in selected)):
         return 1
-    results = [answer.self_test for bus in found for answer in bus.answers] + [one.self_test for one in selected]
+    results = [answer.self_test for bus in buses for answer in bus.answers] + [one.self_test for one in selected]
     return 3 if any(result and result["faults"] for result in results) else 0
 
 
@@ -220,23 +225,27 @@ def as_object(report: SelfTestReport) -> dict[str, Any]:
     }
 
 
+def _print_bus(bus: Bus) -> None:
+    if bus.fault:
+        say(bus.fault)
+        return
+    say(f"/dev/i2c-{bus.number}: " + ("" if bus.answers else "no device that a driver recognises"))
+    for answer in bus.answers:
+        say(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
+        if answer.drivers:
+            used_by = f", used by {answer.used_by}" if answer.used_by else ""
+            say(f"        driver {' or '.join(answer.drivers)}, one register read a transfer as here{used_by}")
+        if answer.warning:
+            say(f"        warning: other devices answer on this bus; {answer.warning}")
+        for line in _self_test_lines(answer.self_test):
+            say(f"        {line}")
+
+
 def _print(buses: list[Bus], selected: list[Selected], ports: list[dict[str, str]], *, named: bool) -> None:
     if not buses and not named:
         say("no I2C bus (no /dev/i2c-N): enable the adapter and load the kernel module i2c-dev")
     for bus in buses:
-        if bus.fault:
-            say(bus.fault)
-            continue
-        say(f"/dev/i2c-{bus.number}: " + ("" if bus.answers else "no device that a driver recognises"))
-        for answer in bus.answers:
-            say(f"  0x{answer.address:02X}  {answer.identity or answer.note}")
-            if answer.drivers:
-                used_by = f", used by {answer.used_by}" if answer.used_by else ""
-                say(f"        driver {' or '.join(answer.drivers)}, one register read a transfer as here{used_by}")
-            if answer.warning:
-                say(f"        warning: other devices answer on this bus; {answer.warning}")
-            for line in _self_test_lines(answer.self_test):
-                say(f"        {line}")
+        _print_bus(bus)
     for one in selected:
         used_by = f", used by {one.used_by}" if one.used_by else ""
         say(f"{one.bus}: {f'{one.identity}, driver {one.driver}{used_by}' if one.identity else one.note}")

@@ -68,10 +68,14 @@ def run_replay(files: Sequence[Path], engines: Engines, *, as_json: bool, jobs: 
         say(line, err=True)
     if unreadable:
         return 2
-    found = [one.file for one in replayed]
-    if any((file.by_own_engine and not file.equal) or (file.fault and file.fault.kind == "corrupt") for file in found):
+    return _status([one.file for one in replayed])
+
+
+def _status(files: Sequence[ReplayedFile]) -> int:
+    """The exit status for files that can be read."""
+    if any((file.by_own_engine and not file.equal) or (file.fault and file.fault.kind == "corrupt") for file in files):
         return 3
-    return 0 if all(file.equal for file in found) else 4
+    return 0 if all(file.equal for file in files) else 4
 
 
 def _replayed(replayer: Replayer, path: Path) -> Replayed | str:

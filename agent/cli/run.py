@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agent.cli.loading import loading
+from agent.cli.rules import check_rules
 from agent.cli.stopping import TOLD, Run, StoppedAtStart, stopped_by_signals
 from agent.config import Config, ConfigError, load_config, parse_config
 from agent.config.key_file import KeyFileError
@@ -70,28 +71,29 @@ def run(
     """Read devices, calibrate, record and publish until Ctrl-C. Without CONFIG the virtual bench is used."""
     if duration is not None and not math.isfinite(duration):
         raise click.BadParameter(f"{duration} is not a number of seconds", param_hint="--duration")
-    if signing_key is not None and config is not None:
-        raise click.UsageError("--signing-key is for the virtual bench; state recording.signing_key in CONFIG")
+    of_bench = "--signing-key is for the virtual bench; state recording.signing_key in CONFIG"
+    check_rules((signing_key is not None and config is not None, of_bench))
     with loading():
         from agent.acquisition.service import Service
         from agent.supervision.logs import log_as_json, under_journal
         from agent.terminal.watch import Watch
     try:
         with ExitStack() as stack:
-            if as_json := log == "json" or (log is None and under_journal(os.environ, sys.stderr.fileno())):
+            journal = log is None and under_journal(os.environ, sys.stderr.fileno())
+            if as_json := journal or log == "json":
                 stack.callback(log_as_json().finish)
-            late_s = lateness_s() if config is None and rate_hz == "auto" else 0.0
+            said: list[str] = []
             if config is None:
-                slow = rate_hz == "250" or late_s > TOO_LATE_S
+                slow = rate_hz == "250" or (rate_hz == "auto" and _too_slow(said))
                 settings, truth = stack.enter_context(virtual_bench(preset, seed, signing_key, slow=slow))
             else:
                 settings, truth = load_config(config), None
             stopping = stack.enter_context(stopped_by_signals())  # up to here a signal ends the process at once
-            too_slow = [TOO_SLOW.format(1e3 * late_s)] if late_s > TOO_LATE_S else []
-            said = [stack.enter_context(router(LOOPBACK, stopping))] if with_router else []
+            if with_router:
+                said.append(stack.enter_context(router(LOOPBACK, stopping)))
             title = f"virtual bench, {preset}" if truth else str(config)
             watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
-            for line in (*too_slow, *said, *signing_key_warnings(settings, data_dir), *_shortcomings(settings)):
+            for line in (*said, *signing_key_warnings(settings, data_dir), *_shortcomings(settings)):
                 watch.say(line)
             stopping.service = Service(settings, data_dir, watch)
             return serve(stopping.service, duration)
@@ -146,6 +148,14 @@ def lateness_s() -> float:
         time.sleep(LOOK_S)
         late_s = max(late_s, time.monotonic() - begun - LOOK_S)
     return late_s
+
+
+def _too_slow(said: list[str]) -> bool:
+    """Whether this computer is too busy for 1000 Hz; then `said` gets a line for the user."""
+    late_s = lateness_s()
+    if late_s > TOO_LATE_S:
+        said.append(TOO_SLOW.format(1e3 * late_s))
+    return late_s > TOO_LATE_S
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import click
 import msgspec
 
 from agent import __version__
+from agent.cli.rules import check_rules
 from agent.core.events import RESULTS, CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.calibrations import calibrations
 from agent.delivery.history import FILE_NAME, History, Record, StoreError
@@ -74,10 +75,10 @@ def show(
     from agent.config.key_file import KeyFileError
     from agent.export.samples import ExportError
 
-    if csv_to is not None and not past:
-        raise click.UsageError("--csv writes the past; add --past, or remove --csv")
-    if past and budget is not None:
-        raise click.UsageError("--past and --budget show different things; remove one of them")
+    check_rules(
+        (csv_to is not None and not past, "--csv writes the past; add --past, or remove --csv"),
+        (past and budget is not None, "--past and --budget show different things; remove one of them"),
+    )
     if recordings:
         _check_recordings(context, needed=past or budget is not None)
     try:
@@ -87,11 +88,7 @@ def show(
             return 3 if refused else 0
         if budget is not None:
             return _show_budget(recordings, data_dir, budget, json_to, public_key)
-        overview = read_overview(data_dir, limit, public_key)
-        if json_to:
-            _write_json(as_object(overview), json_to)
-        else:
-            _print(overview)
+        return _show_overview(read_overview(data_dir, limit, public_key), json_to)
     except (StoreError, KeyFileError, ExportError) as error:
         say(f"fieldcal show: {error}", err=True)
         return 2
@@ -100,6 +97,13 @@ def show(
             raise
         say(f"fieldcal show: {error.filename or data_dir}: {error.strerror}", err=True)
         return 2
+
+
+def _show_overview(overview: Overview, json_to: str | None) -> int:
+    if json_to:
+        _write_json(as_object(overview), json_to)
+    else:
+        _print(overview)
     return 3 if overview.refused else 0
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from click.core import ParameterSource
 from numpy.typing import NDArray
 
+from agent.cli.rules import check_rules
 from agent.cli.simulate_fleet import fleet_options, serve_fleet
 from agent.terminal.text import say
 from hw.virtual.bench import Bench, Truth
@@ -75,21 +76,22 @@ def simulate(
 
     Nothing is sent until a reader opens the port; the first sample is sent then.
     """
+    of_a_track = bool(rate_hz or axes or sequence or loop)
     if fleet["fleet"] is not None:
-        if any(value is not None for value in (preset, directory, play, rate_hz, axes, link)) or sequence or loop:
+        if of_a_track or {preset, directory, play, rate_hz, axes, link} != {None}:
             raise click.UsageError("--fleet goes with --connect, --sensors, --every, --speed, --age, --keys, "
                                    "--truth, --seed and --duration only")  # fmt: skip
         return serve_fleet(seed=seed, duration_s=duration_s, **fleet)
-    if any(name in _given() for name in fleet):
-        raise click.UsageError("--connect, --sensors, --every, --speed, --age, --keys and --truth need --fleet")
-    if (preset is None) == (play is None):
-        raise click.UsageError("give --preset, --play or --fleet")
-    if preset is not None and (rate_hz or axes or sequence or loop):
-        raise click.UsageError("--rate-hz, --axes, --sequence and --loop need --play")
-    if play is not None and directory is not None:
-        raise click.UsageError("--csv needs --preset")
-    if duration_s is not None and directory is None:
-        raise click.UsageError("--duration needs --csv or --fleet")
+    check_rules(
+        (
+            not _given().isdisjoint(fleet),
+            "--connect, --sensors, --every, --speed, --age, --keys and --truth need --fleet",
+        ),
+        ((preset is None) == (play is None), "give --preset, --play or --fleet"),
+        (preset is not None and of_a_track, "--rate-hz, --axes, --sequence and --loop need --play"),
+        (play is not None and directory is not None, "--csv needs --preset"),
+        (duration_s is not None and directory is None, "--duration needs --csv or --fleet"),
+    )
     try:
         if play is not None:
             track = read_track(play, tuple(axes.split(",")) if axes else None, rate_hz)
@@ -99,17 +101,18 @@ def simulate(
         if directory is None:
             return _serve_bench(bench, link)
         write_files(bench, directory, duration_s, {"preset": preset, "seed": seed})
-    except PlaybackError as error:
-        say(str(error), err=True)
-        return 2
-    except (FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        say(f"{error.filename2 or error.filename}: {error.strerror}", err=True)
+    except (PlaybackError, FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
+        say(_worded(error), err=True)
         return 2
     say(
         f"fieldcal calibrate --sensor {directory}/sensor.csv --reference {directory}/reference.csv"
         f" --poses {directory}/poses.csv --nominal {bench.parameters.sensor.nominal_sensitivity:.6g} --u-nominal-pct 20"
     )
     return 0
+
+
+def _worded(error: Exception) -> str:
+    return f"{error.filename2 or error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
 
 
 def _given() -> set[str]:

@@ -10,12 +10,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 import zenoh
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
-from zenoh.ext import HistoryConfig, RecoveryConfig, declare_advanced_subscriber
+from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
 from agent.cli.tls_options import tls_files, tls_options
 from agent.config.key_file import KeyFileError
@@ -111,24 +112,44 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Eve
     faults: list[OSError] = []
 
     def take_all() -> None:
-        refused, silent_until_s = 0, -math.inf
-        for sample in subscriber:
-            address = parse_key(str(sample.key_expr))
-            try:
-                taken, said = kept.take(address.source if address else "", sample.payload.to_bytes())
-            except OSError as error:
-                if error.errno not in FULL:
-                    faults.append(error)
-                    stop.set()
-                    return
-                taken, said = False, f"{address.source if address else ''}: not kept, the disk is full"
-            if said and not taken:
-                refused += 1
-                said = f"{said} ({refused} not kept so far)" if time.monotonic() > silent_until_s else ""
-                silent_until_s = time.monotonic() + TOLD_S if said else silent_until_s
-            if said:
-                say(said)
+        try:
+            _take_all(subscriber, kept)
+        except OSError as error:
+            faults.append(error)
+            stop.set()
 
+    heard = _until_lost(session, key, take_all, subscriber, stop)
+    if not heard:
+        say("fieldcal witness: the router does not answer any more; start this command again", err=True)
+    for fault in faults:
+        say(f"fieldcal witness: {fault}", err=True)
+    return 1 if faults or not heard else 0
+
+
+def _take_all(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
+    """Take each head that comes, and say which are not kept. Raises OSError where a disk fails that is not full."""
+    refused, silent_until_s = 0, -math.inf
+    for sample in subscriber:
+        address = parse_key(str(sample.key_expr))
+        try:
+            taken, said = kept.take(address.source if address else "", sample.payload.to_bytes())
+        except OSError as error:
+            if error.errno not in FULL:
+                raise
+            taken, said = False, f"{address.source if address else ''}: not kept, the disk is full"
+        if said and not taken:
+            refused += 1
+            said = f"{said} ({refused} not kept so far)" if time.monotonic() > silent_until_s else ""
+            silent_until_s = time.monotonic() + TOLD_S if said else silent_until_s
+        if said:
+            say(said)
+
+
+def _until_lost(
+    session: zenoh.Session, key: str, take_all: Callable[[], None], subscriber: AdvancedSubscriber[Any],
+    stop: threading.Event,
+) -> bool:  # fmt: skip
+    """Take heads in a thread until `stop` is set, or the router does not answer any more; returns whether it does."""
     thread = threading.Thread(target=take_all, name="witness", daemon=True)
     thread.start()
     say(f"keeping the heads of {key}")
@@ -139,11 +160,7 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Eve
         heard = not hearing.lost()
     subscriber.undeclare()
     thread.join(CLOSE_S)
-    if not heard:
-        say("fieldcal witness: the router does not answer any more; start this command again", err=True)
-    for fault in faults:
-        say(f"fieldcal witness: {fault}", err=True)
-    return 1 if faults or not heard else 0
+    return heard
 
 
 def _signer(directory: Path) -> Signer:

@@ -50,7 +50,7 @@ def test_no_text_of_the_library_names_an_option_a_command_or_a_setting_of_the_ag
 
 
 def test_a_run_loads_neither_virtual_worlds_nor_what_is_done_at_a_desk() -> None:
-    """`fieldcal run` loads all before devices open; import-linter holds the same for what functions import."""
+    """Beside them, `fieldcal run` asks once, before devices open, what stated positions determine (agent.bench)."""
     code = "import sys, agent.cli.run, agent.acquisition.service, agent.recording.device\nprint(*sorted(sys.modules))"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = run.stdout.split()
