@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,11 +79,16 @@ def decode(text: bytes, columns: int, ignored: frozenset[int] = frozenset()) -> 
     values = np.array(list(map(float, fields))).reshape(-1, columns - len(ignored))
     sound = (np.abs(values) <= LARGEST_EXACT).all(axis=1)
     line = np.array(shaped, np.int64)[sound]
-    others = sorted(set(range(len(lines))).difference(line.tolist())) if len(line) < len(lines) else []
-    bad_at = [number for number in others if not _ignored(lines[number])]
-    overlong = [len(lines[number]) + 1 for number in bad_at if _overlong(lines[number])]
-    faults = Counter(_fault(lines[number]) for number in bad_at if not _overlong(lines[number]))
-    return Decoded(line, values[sound], bad_at, faults, sum(overlong))
+    bad = _bad(lines, line.tolist()) if len(line) < len(lines) else {}
+    overlong = [len(text) + 1 for text in bad.values() if _overlong(text)]
+    faults = Counter(_fault(text) for text in bad.values() if not _overlong(text))
+    return Decoded(line, values[sound], list(bad), faults, sum(overlong))
+
+
+def _bad(lines: Sequence[bytes], good: Sequence[int]) -> dict[int, bytes]:
+    """The bad lines by their numbers, of which `good` are the good ones."""
+    others = sorted(set(range(len(lines))).difference(good))
+    return {number: lines[number] for number in others if not _ignored(lines[number])}
 
 
 def _ignored(line: bytes) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any, get_args, get_type_hints
 
@@ -190,29 +191,51 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
+def _is_rate(value: Any) -> bool:
+    return isinstance(value, float | int) and 0 < value <= FASTEST_HZ
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= LONGEST_TEXT
+
+
+def _is_unit(value: Any) -> bool:
+    return _is_text(value) and bool(value)
+
+
+def _is_size(value: Any) -> bool:
+    return value is None or (isinstance(value, float | int) and 1 / LARGEST <= value <= LARGEST)
+
+
+def _is_named(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(name, str) for name in value)
+
+
+def _are_lines(value: Any) -> bool:
+    return isinstance(value, tuple | list) and all(isinstance(line, str) for line in value)
+
+
+_TEXT = f"it must be a text of at most {LONGEST_TEXT} characters"
+_SIZE = f"it must be None or a number from {1 / LARGEST:g} to {LARGEST:g}"
+# What each field of DeviceInfo must be, and this in words.
+_INFO: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+    ("nominal_rate_hz", _is_rate, f"it must be a number above 0 and at most {FASTEST_HZ:g}"),
+    ("axes", lambda value: value in (1, 3), "only 1 and 3 are possible"),
+    *((name, _is_text, _TEXT) for name in ("driver", "kind", "serial_number")),
+    ("unit", _is_unit, _TEXT),
+    *((name, _is_size, _SIZE) for name in ("range_mps2", "nominal_sensitivity")),
+    ("own_clock", lambda value: isinstance(value, bool), "it must be True or False"),
+    ("settings", _is_named, "it must be a dictionary of texts"),
+    *((name, _are_lines, "it must be a tuple of texts") for name in ("filters", "filter_settings")),
+)
+
+
 def _info_fault(info: DeviceInfo) -> str:
     """What of the information on a device cannot be used, with the value; "" if all can."""
-    rate_hz = info.nominal_rate_hz
-    if not isinstance(rate_hz, float | int) or not 0 < rate_hz <= FASTEST_HZ:
-        return f"nominal_rate_hz is {shown(rate_hz)}; it must be a number above 0 and at most {FASTEST_HZ:g}"
-    if info.axes not in (1, 3):
-        return f"axes is {shown(info.axes)}; only 1 and 3 are possible"
-    for name in ("driver", "kind", "serial_number", "unit"):
-        text = getattr(info, name)
-        if not isinstance(text, str) or len(text) > LONGEST_TEXT or (name == "unit" and not text):
-            return f"{name} is {shown(text)}; it must be a text of at most {LONGEST_TEXT} characters"
-    for name in ("range_mps2", "nominal_sensitivity"):
+    for name, good, wanted in _INFO:
         value = getattr(info, name)
-        if value is not None and not (isinstance(value, float | int) and 1 / LARGEST <= value <= LARGEST):
-            return f"{name} is {shown(value)}; it must be None or a number from {1 / LARGEST:g} to {LARGEST:g}"
-    if not isinstance(info.own_clock, bool):
-        return f"own_clock is {shown(info.own_clock)}; it must be True or False"
-    if not isinstance(info.settings, dict) or not all(isinstance(name, str) for name in info.settings):
-        return f"settings is {shown(info.settings)}; it must be a dictionary of texts"
-    for name in ("filters", "filter_settings"):
-        lines = getattr(info, name)
-        if not isinstance(lines, tuple | list) or not all(isinstance(line, str) for line in lines):
-            return f"{name} is {shown(lines)}; it must be a tuple of texts"
+        if not good(value):
+            return f"{name} is {shown(value)}; {wanted}"
     try:
         size = len(json.dumps(asdict(info), ensure_ascii=False, allow_nan=False).encode())
     except (TypeError, ValueError) as error:

@@ -180,6 +180,14 @@ class Replayed:
     left_sha256: str = ""
     left: list[Memory] = field(default_factory=list)
 
+    def add(self, recorded: Sequence[Output], computed: Sequence[Output]) -> None:
+        """Take the results of one event: those that are recorded, and those that were computed."""
+        numbers = [result.sequence for result in recorded if isinstance(result, Result)]
+        self.first_result = self.first_result or next(iter(numbers), 0)
+        self.last_result = max([self.last_result, *numbers])
+        self.calibrations += [result for result in computed if isinstance(result, CalibrationUpdate)]
+        self.windows += [result for result in computed if isinstance(result, WindowReport)]
+
 
 @dataclass(frozen=True, slots=True)
 class Replayer:
@@ -277,11 +285,7 @@ class _One:
         if not step.complete and len(computed) > len(step.results):
             self._left = before
         file.results += len(computed)
-        numbers = [result.sequence for result in step.results if isinstance(result, Result)]
-        self._found.first_result = self._found.first_result or next(iter(numbers), 0)
-        self._found.last_result = max([self._found.last_result, *numbers])
-        self._found.calibrations += [result for result in computed if isinstance(result, CalibrationUpdate)]
-        self._found.windows += [result for result in computed if isinstance(result, WindowReport)]
+        self._found.add(step.results, computed)
         if not computed and not step.results:
             return
         if file.departure is not None:

@@ -69,10 +69,7 @@ def run(
     with_router: bool,
 ) -> int:
     """Read devices, calibrate, record and publish until Ctrl-C. Without CONFIG the virtual bench is used."""
-    if duration is not None and not math.isfinite(duration):
-        raise click.BadParameter(f"{duration} is not a number of seconds", param_hint="--duration")
-    of_bench = "--signing-key is for the virtual bench; state recording.signing_key in CONFIG"
-    check_rules((signing_key is not None and config is not None, of_bench))
+    _check(duration, signing_key, config)
     with loading():
         from agent.acquisition.service import Service
         from agent.supervision.logs import log_as_json, under_journal
@@ -107,6 +104,13 @@ def run(
     except StoppedAtStart:
         say(TOLD, err=True)
         return 0
+
+
+def _check(duration: float | None, signing_key: Path | None, config: Path | None) -> None:
+    if duration is not None and not math.isfinite(duration):
+        raise click.BadParameter(f"{duration} is not a number of seconds", param_hint="--duration")
+    of_bench = "--signing-key is for the virtual bench; state recording.signing_key in CONFIG"
+    check_rules((signing_key is not None and config is not None, of_bench))
 
 
 def serve(service: Service, duration_s: float | None) -> int:

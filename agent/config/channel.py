@@ -199,6 +199,14 @@ class Channel(Knowledge):
             raise ValueError(f"poses_repeat_s {self.poses_repeat_s} is shorter than the poses, which end at {end}")
         return self
 
+    def _check_clamp(self) -> None:
+        if self.reference is None:
+            raise ValueError('positions = "free" is for a clamp, so it needs a reference; name one')
+        if self.clamp_theta_deg is not None and abs(self.clamp_theta_deg) < LEAST_LEANING_DEG:
+            raise ValueError(
+                f"clamp_theta_deg {self.clamp_theta_deg}: gravity cannot show alpha below {LEAST_LEANING_DEG:g} deg"
+            )
+
     @model_validator(mode="after")
     def _found_by_gravity(self) -> Channel:
         if self.clamp_theta_deg is not None and self.positions != "free":
@@ -212,12 +220,7 @@ class Channel(Knowledge):
                 'positions are found from gravity, which a sensor with coupling = "ac" does not measure; give poses'
             )
         if self.positions == "free":
-            if self.reference is None:
-                raise ValueError('positions = "free" is for a clamp, so it needs a reference; name one')
-            if self.clamp_theta_deg is not None and abs(self.clamp_theta_deg) < LEAST_LEANING_DEG:
-                raise ValueError(
-                    f"clamp_theta_deg {self.clamp_theta_deg}: gravity cannot show alpha below {LEAST_LEANING_DEG:g} deg"
-                )
+            self._check_clamp()
             return self
         if len(self.positions) < 2:
             raise ValueError("positions: there is only one, so there is nothing to find; state it in poses instead")

@@ -165,6 +165,15 @@ def _entries(raw: Mapping[str, Any], section: str) -> list[Mapping[str, Any]]:
     return [entry if isinstance(entry, Mapping) else {} for entry in held] if isinstance(held, list) else []
 
 
+def _of_length(path: Path, raw: Any, kind: type[BaseModel]) -> Told | None:
+    """The innermost list on the way to a fault whose length is wrong, and how; None where there is none."""
+    for length in range(len(path), 0, -1):
+        value = _at(raw, path[:length])
+        if isinstance(value, list | tuple) and (what := length_fault(value, path[:length], kind)):
+            return path[:length], what
+    return None
+
+
 def told(error: ValidationError, raw: Any, kind: type[BaseModel], *, but_of_the_whole: bool = False) -> Iterator[Told]:
     """The faults that a model of this kind found in the values of a TOML file: where, and what is wrong."""
     faults = [fault for fault in error.errors() if fault["loc"] or not but_of_the_whole]
@@ -178,14 +187,7 @@ def told(error: ValidationError, raw: Any, kind: type[BaseModel], *, but_of_the_
         if len(said) >= SHOWN_FAULTS:
             yield path, ""  # only counted: to word tens of thousands takes minutes
             continue
-        for length in range(len(path), 0, -1):
-            if isinstance(value := _at(raw, path[:length]), list | tuple) and (
-                what := length_fault(value, path[:length], kind)
-            ):
-                path = path[:length]
-                break
-        else:
-            path, what = _what(fault, path, kind)
+        path, what = _of_length(path, raw, kind) or _what(fault, path, kind)
         if path in said and fault["type"] not in ("value_error", "extra_forbidden"):
             continue  # of alternatives that all do not fit, and of a list whose length is wrong, one fault is told
         said.add(path)

@@ -89,6 +89,15 @@ class States:
         return next((m.sequence for m in self.memories if (m.sensor, m.identity) == (sensor, identity)), 0)
 
 
+def _take_from(states: States, found: Sequence[Memory] | None, number: int, name: str, *, signed: bool) -> None:
+    """Take the states where a recording ends; `found` is None where it does not give them."""
+    if found is not None:
+        states.take(found, number)
+        states.faults[:] = [f"{fault}; {name} gives them instead" for fault in states.faults]
+    elif signed:
+        states.faults.append(f"{name} does not give the states of the estimation where it ends")
+
+
 def states_at_start(
     connection: sqlite3.Connection,
     directory: Path,
@@ -117,11 +126,7 @@ def states_at_start(
             states.faults.append("the states of the estimation in the store are older than the newest recording")
         if behind or lost or states.late:
             found = recall(files.pop(final_name(path)), keys)
-            if found is not None:
-                states.take(found, number)
-                states.faults[:] = [f"{fault}; {path.name} gives them instead" for fault in states.faults]
-            elif key is not None:
-                states.faults.append(f"{path.name} does not give the states of the estimation where it ends")
+            _take_from(states, found, number, path.name, signed=key is not None)
             lost = lost or found is None
         states.recording, states.sequence = max(states.recording, number), max(states.sequence, last)
     if lost:

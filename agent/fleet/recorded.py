@@ -54,10 +54,9 @@ class Recorded:
     reason: str = ""
 
 
-def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
-    """The devices and meetings of recordings. Raises TableError."""
+def _starts(paths: Sequence[Path]) -> Iterator[tuple[Path, RunStart]]:
+    """The recordings with their first events. Raises TableError, also where one is given twice."""
     starts: dict[tuple[str, int], Path] = {}
-    found: list[Recorded] = []
     for path in paths:
         start = first_event(path)
         if start is None:
@@ -65,7 +64,12 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
         other = starts.setdefault((start.run_id, start.file_sequence), path)
         if other is not path:
             raise TableError(f"{path}: this is the same recording as {other}; give each recording once")
-        found += _channels(path, start)
+        yield path, start
+
+
+def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
+    """The devices and meetings of recordings. Raises TableError."""
+    found = [one for path, start in _starts(paths) for one in _channels(path, start)]
     together: dict[tuple[str, str], list[Recorded]] = {}
     for one in found:
         together.setdefault((one.sensor, one.reference), []).append(one)

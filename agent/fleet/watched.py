@@ -176,22 +176,25 @@ def _taken(
 def _wrong(line: Line) -> str:
     """Why the content of a line cannot be used; "" where it can."""
     b = len(line.band_hz)
-    if line.hour_utc_ns % HOUR_NS or not YEARS_H[0] <= line.hour_utc_ns // HOUR_NS < YEARS_H[1]:
-        return "hour_utc_ns is not the begin of an hour between 2000 and 2100"
-    if not b or len(line.band_power) != 3 * b or len(line.cross_power) != 3 * b or len(line.noise_psd) != 3:
-        return "band_power and cross_power do not have three values for each of band_hz, or noise_psd not three"
-    if len(set(_grid(line.band_hz))) != b:
-        return "band_hz are not third octaves 10^(n/10) Hz between 0.06 and 1000 Hz, each once"
+    hour, odd = divmod(line.hour_utc_ns, HOUR_NS)
+    lengths = len(line.band_power), len(line.cross_power), len(line.noise_psd)
     numbers = [*line.band_power, *line.cross_power, *line.noise_psd]
-    if any(value is not None and not abs(value) <= LARGEST for value in numbers):
-        return f"a power is beyond {LARGEST:g} (m/s2)2"
-    if line.temperature_degc is not None and not -100.0 <= line.temperature_degc <= 200.0:
-        return "temperature_degc is not between -100 and 200"
-    if not line.duration_s >= LEAST_COVERED_S or line.samples <= 0:
-        return f"less than {LEAST_COVERED_S:g} s of the hour are covered"
-    if line.stuck + line.clipped > MOST_WRONG * line.samples:
-        return f"more than {100.0 * MOST_WRONG:g} % of the samples are stuck or clipped"
-    return ""
+    rules = (
+        (odd or not YEARS_H[0] <= hour < YEARS_H[1], "hour_utc_ns is not the begin of an hour between 2000 and 2100"),
+        (not b or lengths != (3 * b, 3 * b, 3),
+         "band_power and cross_power do not have three values for each of band_hz, or noise_psd not three"),
+        (len(set(_grid(line.band_hz))) != b,
+         "band_hz are not third octaves 10^(n/10) Hz between 0.06 and 1000 Hz, each once"),
+        (any(value is not None and not abs(value) <= LARGEST for value in numbers),
+         f"a power is beyond {LARGEST:g} (m/s2)2"),
+        (line.temperature_degc is not None and not -100.0 <= line.temperature_degc <= 200.0,
+         "temperature_degc is not between -100 and 200"),
+        (not line.duration_s >= LEAST_COVERED_S or line.samples <= 0,
+         f"less than {LEAST_COVERED_S:g} s of the hour are covered"),
+        (line.stuck + line.clipped > MOST_WRONG * line.samples,
+         f"more than {100.0 * MOST_WRONG:g} % of the samples are stuck or clipped"),
+    )  # fmt: skip
+    return next((message for broken, message in rules if broken), "")
 
 
 def _grid(band_hz: list[float]) -> list[int]:

@@ -64,8 +64,7 @@ class Users:
         return self._users
 
 
-def read_users(path: Path) -> dict[str, User]:
-    """Read a file of users. Raises UsersError, which names the line, also where another user may read the file."""
+def _text_of(path: Path) -> str:
     try:
         data, exposed = read_private_file(path, LARGEST)
         text = data.decode()
@@ -75,8 +74,13 @@ def read_users(path: Path) -> dict[str, User]:
         raise UsersError(f"{path}: not a file of users: {error}") from None
     if exposed:
         raise UsersError(f"{path}: {exposed}")
+    return text
+
+
+def read_users(path: Path) -> dict[str, User]:
+    """Read a file of users. Raises UsersError, which names the line, also where another user may read the file."""
     users: dict[str, User] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(_text_of(path).splitlines(), start=1):
         if not line.strip() or line.startswith("#"):
             continue
         words, where = line.split(), f"{path}: line {number}"

@@ -132,19 +132,26 @@ def _moment_s(text: str, order: str, offset_s: int) -> float:
     return whole_s - (_zone_s(found["zone"], whole_s) if found["zone"] else offset_s) + (ns % 10**9) * 1e-9
 
 
+def _orders(text: str) -> tuple[list[str], list[str]]:
+    """The three fields of a date, and the orders in which they may stand."""
+    if text.isdigit():
+        return [text[:4], text[4:6], text[6:]], ["ymd"]
+    fields = re.findall(r"\d+|[A-Za-z]+", text)
+    if fields[0].isalpha():
+        return fields, ["mdy"]
+    if fields[1].isalpha():
+        return fields, ["dmy"]
+    if len(fields[0]) > 2:
+        return fields, ["ymd"]
+    if len(fields[2]) == 4:
+        return fields, ["dmy"] if "." in text else ["dmy", "mdy"]
+    return fields, ["dmy", "mdy", "ymd"]
+
+
 @lru_cache(maxsize=1024)
 def _day_number(text: str, order: str) -> int:
     """The day's number in the proleptic Gregorian calendar. Raises UnclearError."""
-    fields = re.findall(r"\d+|[A-Za-z]+", text)
-    if text.isdigit():
-        fields, orders = [text[:4], text[4:6], text[6:]], ["ymd"]
-    elif fields[0].isalpha() or fields[1].isalpha():
-        orders = ["mdy" if fields[0].isalpha() else "dmy"]
-    elif len(fields[0]) > 2:
-        orders = ["ymd"]
-    else:
-        orders = ["dmy"] if "." in text and len(fields[2]) == 4 else ["dmy", "mdy"]
-        orders += [] if len(fields[2]) == 4 else ["ymd"]
+    fields, orders = _orders(text)
     numbers = {o: n for o in orders if (n := _ordinal(dict(zip(o, fields, strict=True)))) is not None}
     if order in orders or len(orders) == 1:
         numbers = {o: n for o, n in numbers.items() if len(orders) == 1 or o == order}
@@ -171,6 +178,14 @@ def _ordinal(fields: dict[str, str]) -> int | None:
         return None
 
 
+def _hour(text: str, half: str | None) -> int:
+    """The hour of the day; `half`: A or P where the day has two halves. 99 for an hour that these do not have."""
+    hour = int(text)
+    if not half:
+        return hour
+    return hour % 12 + (12 if half in "Pp" else 0) if 1 <= hour <= 12 else 99
+
+
 def _clock_ns(text: str, with_day: bool) -> int:
     """A time of day in ns. Raises UnclearError."""
     found = _PARTS.fullmatch(text)
@@ -180,9 +195,7 @@ def _clock_ns(text: str, with_day: bool) -> int:
         raise UnclearError(f"{text!r} may be hours and minutes, or minutes and seconds; write HH:MM:SS")
     if third is None and fraction is not None:
         first, second, third = "0", first, second
-    hour, minute, s = int(first), int(second), int(third or 0)
-    if half:
-        hour = hour % 12 + (12 if half in "Pp" else 0) if 1 <= hour <= 12 else 99
+    hour, minute, s = _hour(first, half), int(second), int(third or 0)
     if minute > 59 or s > 60 or hour > (23 if with_day or half else 999):
         raise UnclearError(f"{text!r} is no time of day; correct it")
     return ((60 * hour + minute) * 60 + s) * 10**9 + int((fraction or "").ljust(9, "0"))

@@ -221,20 +221,30 @@ def _words_in(fields: Sequence[str]) -> set[int]:
     return {k for k, field in enumerate(fields) if not _is_value(field) and field.lower() not in MISSING}
 
 
+def _before(
+    lines: Sequence[str], split: Sequence[tuple[int, list[str]]], delimiter: str, rows: Sequence[list[str]]
+) -> tuple[list[tuple[int, list[str]]], int]:
+    """The lines before the data that may be their header, and the number of columns. The last of `split` is data."""
+    *above, (first_line, _) = split
+    width = len(rows[0])
+    before = [(n, named) for n, fields in above if (named := _named(fields, width)) is not None]
+    if not before:
+        before = _in_comment(lines, first_line, delimiter, width)
+    if not before and above and len(above[-1][1]) > 1 and not any(map(_is_value, above[-1][1])):
+        before = [above[-1]]  # the rows have another number of fields, which their reader tells
+        width = max(width, len(_stripped(before[0][1])))
+    if before and len(before[-1][1]) != width and _is_counted(rows):
+        width = len(before[-1][1])
+    return before, width
+
+
 def _of_rows(
     encoding: str, delimiter: str, lines: Sequence[str], split: Sequence[tuple[int, list[str]]], first: int, order: str
 ) -> Dialect:
     """The dialect of a file whose lines are split, the line at `first` being the first line of data."""
     rows = [fields for _, fields in split[first : first + SAMPLE_ROWS]]
-    width, first_line = len(rows[0]), split[first][0]
-    before = [(n, named) for n, fields in split[:first] if (named := _named(fields, width)) is not None]
-    if not before:
-        before = _in_comment(lines, first_line, delimiter, width)
-    if not before and first and len(split[first - 1][1]) > 1 and not any(map(_is_value, split[first - 1][1])):
-        before = [split[first - 1]]  # the rows have another number of fields, which their reader tells
-        width = max(width, len(_stripped(before[0][1])))
-    if before and len(before[-1][1]) != width and _is_counted(rows):
-        width = len(before[-1][1])
+    first_line = split[first][0]
+    before, width = _before(lines, split[: first + 1], delimiter, rows)
     header, header_line, units = _header(before, width)
     head = tuple(lines[: first_line - 1])
     cells = [[row[k] for row in rows if len(row) > k and row[k].lower() not in MISSING] for k in range(width)]
@@ -309,8 +319,7 @@ def _parts(
     header: Sequence[str], units: Sequence[str], moments: Sequence[str], cells: Sequence[Sequence[str]]
 ) -> tuple[Part, ...]:
     """The columns of the table. A moment is called "time" where no name tells a time."""
-    days, clocks = ([k for k, kind in enumerate(moments) if kind == which] for which in ("day", "clock"))
-    with_clock = {day: clock for day in days for clock in clocks if abs(day - clock) == 1 or len(clocks) == 1}
+    with_clock = _clocks_of_days(moments)
     parts: dict[int, Part] = {}
     for k, name in enumerate(header):
         places, per = [k], [1.0]
@@ -321,11 +330,22 @@ def _parts(
             places, per = [*places, k + 1], [*per, 1e-3]
         if k not in with_clock and name and not any(k in part.places for part in parts.values()):
             parts[k] = Part(name, "s" if moments[k] else units[k], tuple(places), tuple(per))
+    return tuple(_with_time(parts, moments).values())
+
+
+def _with_time(parts: dict[int, Part], moments: Sequence[str]) -> dict[int, Part]:
+    """The parts; the only moment among them is called "time" where no name tells a time."""
     told = [k for k, part in parts.items() if part.unit == "s" and moments[k]]
-    if len(told) == 1 and not any(names_time(part.name) for part in parts.values()):
-        only = parts[told[0]]
-        parts[told[0]] = Part("time", only.unit, only.places, only.per)
-    return tuple(parts.values())
+    if len(told) != 1 or any(names_time(part.name) for part in parts.values()):
+        return parts
+    only = parts[told[0]]
+    return parts | {told[0]: Part("time", only.unit, only.places, only.per)}
+
+
+def _clocks_of_days(moments: Sequence[str]) -> dict[int, int]:
+    """The column with the time of day that belongs to each column with a day."""
+    days, clocks = ([k for k, kind in enumerate(moments) if kind == which] for which in ("day", "clock"))
+    return {day: clock for day in days for clock in clocks if abs(day - clock) == 1 or len(clocks) == 1}
 
 
 def _counts_thousandths(header: Sequence[str], cells: Sequence[Sequence[str]], clock: int) -> bool:
@@ -344,25 +364,29 @@ def names_time(name: str) -> bool:
 
 def _rate_hz(lines: Sequence[str]) -> float | None:
     """The rate that a head states. None where it states none, or several."""
-    rates = set()
-    for line in lines:
-        plain = line.replace('"', "").replace("'", "")
-        for found in _RATE.finditer(plain):
-            hertz = [
-                scale for unit, scale in _HERTZ.items() if re.search(rf"(?<![a-z]){unit}(?![a-z])", found[0].lower())
-            ]
-            if hertz or not found[0].lower().startswith(("rate", "freq", "fs", "odr", "at")):
-                rates.add((hertz or [1.0])[0] * _plain_number(found["value"]))
-        for found in _INTERVAL.finditer(plain):
-            unit = _SECONDS.search(found[0])
-            second = (
-                unit_of(unit[0]) if unit else unit_of("s") if found[0].lower().startswith(("delta", "dt")) else None
-            )
-            value = _plain_number(found["value"])
-            if second is not None and value:
-                rates.add(round(1.0 / (value * second.si), 12))
-    rates = {rate for rate in rates if RATES_HZ[0] < rate < RATES_HZ[1]}
+    plain = [line.replace('"', "").replace("'", "") for line in lines]
+    stated = {rate for line in plain for rate in (*_rates_hz(line), *_of_intervals_hz(line))}
+    rates = {rate for rate in stated if RATES_HZ[0] < rate < RATES_HZ[1]}
     return rates.pop() if len(rates) == 1 else None
+
+
+def _rates_hz(line: str) -> Iterator[float]:
+    """The rates that a line states as such."""
+    for found in _RATE.finditer(line):
+        name = found[0].lower()
+        hertz = [scale for unit, scale in _HERTZ.items() if re.search(rf"(?<![a-z]){unit}(?![a-z])", name)]
+        if hertz or not name.startswith(("rate", "freq", "fs", "odr", "at")):
+            yield (hertz or [1.0])[0] * _plain_number(found["value"])
+
+
+def _of_intervals_hz(line: str) -> Iterator[float]:
+    """The rates that follow from intervals of time which a line states."""
+    for found in _INTERVAL.finditer(line):
+        unit = _SECONDS.search(found[0])
+        second = unit_of(unit[0]) if unit else unit_of("s") if found[0].lower().startswith(("delta", "dt")) else None
+        value = _plain_number(found["value"])
+        if second is not None and value:
+            yield round(1.0 / (value * second.si), 12)
 
 
 def _plain_number(text: str) -> float:

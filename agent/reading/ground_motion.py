@@ -46,17 +46,28 @@ class GroundMotion(Arrays):
             raise faults[0]
         super().__init__(source.path, values)
 
+    def _each(
+        self, names: Sequence[str], group: str, found: Sequence[Component], flat: Sequence[Flat]
+    ) -> dict[Column, Slices]:
+        """Each channel by itself as an acceleration."""
+        samples: dict[Column, Slices] = {}
+        for name, component, own in zip(names, found, flat, strict=True):
+            column = Column(name, "m/s2", group)
+            self.components[column] = component
+            samples[column] = Sum([own], [1.0 / component.sensitivity])
+        return samples
+
     def _group(self, source: MiniSeed, station: StationXml, role: Role, time: Column) -> dict[Column, Slices]:
         grid = source.values[time]
         assert isinstance(grid, Grid | Stretches)
         columns = [c for c in source.seed_ids if c.group == time.group]
         found = [station.component(source.seed_ids[c], grid.start_s, grid.rate_hz) for c in columns]
-        for component in found:
-            if abs(component.inconsistent) > CONSISTENT:
-                self.said.append(
-                    f"{station.path}, channel {component.seed_id}: the stages of the response differ from the overall "
-                    f"sensitivity by {100.0 * component.inconsistent:.3g} %; the overall sensitivity is used"
-                )
+        self.said += [
+            f"{station.path}, channel {component.seed_id}: the stages of the response differ from the overall "
+            f"sensitivity by {100.0 * component.inconsistent:.3g} %; the overall sensitivity is used"
+            for component in found
+            if abs(component.inconsistent) > CONSISTENT
+        ]
         flat = [Flat(source.values[c], grid.rate_hz, each) for c, each in zip(columns, found, strict=True)]
         if role == "sensor":
             names = _axes(found) if len(found) == len(AXES) else [c.name for c in columns]
@@ -64,9 +75,8 @@ class GroundMotion(Arrays):
             self.components |= {column: component for column, (_, component) in told.items()}
             return {time: grid} | {column: samples for column, (samples, _) in told.items()}
         if len(found) != len(AXES):
-            one = {Column("a" if len(found) == 1 else c.name, "m/s2", time.group): k for k, c in enumerate(columns)}
-            self.components |= {column: found[k] for column, k in one.items()}
-            return {time: grid} | {column: Sum([flat[k]], [1.0 / found[k].sensitivity]) for column, k in one.items()}
+            names = ["a"] if len(found) == 1 else [c.name for c in columns]
+            return {time: grid} | self._each(names, time.group, found, flat)
         turned = _turned(station, found) / [c.sensitivity for c in found]
         whole: dict[Column, Slices] = {time: grid}
         for name, weights, (azimuth, dip) in zip(AXES, turned, EAST_NORTH_UP, strict=True):

@@ -41,8 +41,8 @@ class Channel:
         return np.asarray((part.astype(np.float64) - zero) / FULL_SCALE[self._bits])
 
 
-def open_wav(path: Path) -> Arrays:
-    """A WAV file as columns `time_s`, `ch1`, `ch2`, ... Raises TableError."""
+def _chunks(path: Path) -> tuple[bytes, tuple[int, int]]:
+    """The chunk that describes the samples, and where those are: offset and length in bytes. Raises TableError."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(12)
@@ -59,6 +59,12 @@ def open_wav(path: Path) -> Arrays:
             file.seek(at + length + length % 2, os.SEEK_SET)
     if len(form) < 16 or not data[1]:
         raise TableError(f"{path}: the file has no {'samples' if len(form) >= 16 else 'format'}; write it anew")
+    return form, data
+
+
+def open_wav(path: Path) -> Arrays:
+    """A WAV file as columns `time_s`, `ch1`, `ch2`, ... Raises TableError."""
+    form, data = _chunks(path)
     kind, channels, rate_hz, _, frame, bits = struct.unpack_from("<HHIIHH", form)
     if kind == EXTENSIBLE and len(form) >= 26:
         kind = int.from_bytes(form[24:26], "little")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -77,6 +77,11 @@ def compare(
     return None
 
 
+def _largest(values: Iterable[Any]) -> float:
+    """The largest absolute value among the finite numbers; 0 without any."""
+    return max((abs(x) for x in values if isinstance(x, float) and math.isfinite(x)), default=0.0)
+
+
 def differences(
     a: Any, b: Any, tolerance: float, where: str = "", scale: float = 0.0
 ) -> Iterator[tuple[str, Any, Any]]:
@@ -86,7 +91,7 @@ def differences(
             inside = f"{where}.{name}" if where else name
             yield from differences(a.get(name), b.get(name), tolerance, inside)
     elif isinstance(a, list | tuple) and isinstance(b, list | tuple) and len(a) == len(b):
-        scale = max((abs(x) for x in (*a, *b) if isinstance(x, float) and math.isfinite(x)), default=0.0)
+        scale = _largest((*a, *b))
         for i, (x, y) in enumerate(zip(a, b, strict=True)):
             yield from differences(x, y, tolerance, f"{where}[{i}]", scale)
     elif isinstance(a, float) and isinstance(b, float):

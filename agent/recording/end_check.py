@@ -97,8 +97,7 @@ def check_end(
         except SignedTextError as error:
             end.reasons.append(f"{given.source}: not a head: {error}")
             continue
-        wrong = signed.fault_by(keys, head.statement.gateway) if keys is not None else signed.fault()
-        if wrong:
+        if wrong := _signature_fault(signed, keys, head):
             end.reasons.append(f"{given.source}: its signature is not by the given key: {wrong}")
             continue
         if gateway and head.statement.gateway != gateway:
@@ -111,17 +110,26 @@ def check_end(
             newest = head, given
     if newest is not None:
         _name(end, *newest, now_ns)
-    if newest is None:
-        end.unproven.append(NO_HEAD)
-    elif not any(given.elsewhere for given in heads):
-        end.unproven.append(BESIDE)
-    else:
-        end.unproven.append(f"whether more was recorded after {when(end.utc_ns)}")
-    for what, numbers in undecided.items():
-        end.unproven.append(f"{what} (recording {min(numbers)}{f' and {n} more' if (n := len(numbers) - 1) else ''})")
+    end.unproven += _unproven(end, heads, undecided)
     if keys is None:
         end.unproven.append(NO_KEY)
     return end
+
+
+def _unproven(end: End, heads: Sequence[GivenHead], undecided: Mapping[str, Sequence[int]]) -> Iterator[str]:
+    """What the heads do not show: `end` names the newest of those that are heads, `undecided` recordings by reason."""
+    if end.age_s is None:
+        yield NO_HEAD
+    elif not any(given.elsewhere for given in heads):
+        yield BESIDE
+    else:
+        yield f"whether more was recorded after {when(end.utc_ns)}"
+    for what, numbers in undecided.items():
+        yield f"{what} (recording {min(numbers)}{f' and {n} more' if (n := len(numbers) - 1) else ''})"
+
+
+def _signature_fault(signed: SignedText, keys: KnownKeys | None, head: Head) -> str:
+    return signed.fault() if keys is None else signed.fault_by(keys, head.statement.gateway)
 
 
 def _name(end: End, head: Head, given: GivenHead, now_ns: int) -> None:

@@ -44,6 +44,13 @@ class Gone:
     faults: tuple[str, ...] = ()
     unproven: tuple[str, ...] = ()
 
+    def _stated_alone(self, number: int) -> str:
+        """Why a statement that a recording was deleted is not enough; "" where there is none."""
+        if first_outside(self.statements, number, number) is not None:
+            return ""
+        only = f"recording {number}, which this head names, is not there: only a statement says that it was deleted"
+        return f"{only}, no later recording; the next recording of the gateway will repeat that"
+
     def compare(self, head: Head) -> tuple[str, str]:
         """(why the recording that a head names and that is not there should be there or was another one, what cannot be
         shown of it); "" for none. Only later recordings count: a statement alone can come from a copy of the directory.
@@ -51,10 +58,7 @@ class Gone:
         said, number = head.statement, head.statement.file_sequence
         entries = [entry for entry in self.deleted if entry.first - 1 <= number <= entry.last + 1]
         if first_outside(entries, number, number) is not None:
-            stated = first_outside(self.statements, number, number) is None
-            only = f"recording {number}, which this head names, is not there: only a statement says that it was deleted"
-            remedy = "the next recording of the gateway will repeat that"
-            return (f"{only}, no later recording; {remedy}" if stated else ""), ("" if self.whole else NOT_GIVEN)
+            return self._stated_alone(number), ("" if self.whole else NOT_GIVEN)
         epochs = {entry.epoch for entry in entries if entry.first <= number <= entry.last and entry.epoch}
         if said.epoch and epochs and said.epoch not in epochs:
             return f"recording {number} of the epoch {said.epoch}, which this head names, is not there", ""

@@ -139,11 +139,15 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
             sound.chunks = len(sound.derived.chunks)
     except RecordError as error:
         broken = broken or error
-    if broken is not None:
-        unlike_a_crash = goes_on or (broken.fault.kind == "corrupt" and not sound.chunks)
-        if unlike_a_crash or not _ends_in_zeros(file, sound.length + TAIL_MAX):
-            raise broken
+    if broken is not None and (goes_on or not _is_torn(file, sound, broken)):
+        raise broken
     return sound
+
+
+def _is_torn(file: BinaryIO, sound: _Sound, broken: RecordError) -> bool:
+    """Whether a file that is broken there may be one that a crash has left."""
+    corrupt = broken.fault.kind == "corrupt" and not sound.chunks
+    return not corrupt and _ends_in_zeros(file, sound.length + TAIL_MAX)
 
 
 def _is_sound(chunk: Record) -> bool:

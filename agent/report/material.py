@@ -13,6 +13,7 @@ import numpy as np
 from agent.calibrate.origin import SourceFile, source_file
 from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
+from agent.core.memory import Memory
 from agent.core.outcome import with_budget
 from agent.core.past import PastError, budget_in_force
 from agent.delivery.calibrations import calibrations, made
@@ -119,6 +120,14 @@ def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:
     return material
 
 
+def _with_kept_budget(update: CalibrationUpdate, memories: Sequence[Memory]) -> tuple[CalibrationUpdate, str]:
+    """The calibration with the budget of all kept windows, and how its u compares. Raises PastError."""
+    found = budget_in_force(update, memories)
+    ratio = found.standard_uncertainty / np.array(update.standard_uncertainty)
+    times = f"{ratio.min():.4f} to {ratio.max():.4f} times u in force"
+    return with_budget(update, found), f"of all kept windows, solved anew; its u is {times}"
+
+
 def _from_directory(directory: Path, sensor: str | None) -> Material:
     with History(directory / FILE_NAME) as history:
         names = sorted({name for name, what in history.channels() if name and what in ("window", "calibration")})
@@ -139,11 +148,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     missing, facts = list[str](), dict[str, Any]()
     if newest and not newest[0].budget:
         try:
-            found = budget_in_force(newest[0], memories)
-            ratio = found.standard_uncertainty / np.array(newest[0].standard_uncertainty)
-            newest = [with_budget(newest[0], found)]
-            times = f"{ratio.min():.4f} to {ratio.max():.4f} times u in force"
-            facts["uncertainty budget"] = f"of all kept windows, solved anew; its u is {times}"
+            newest[0], facts["uncertainty budget"] = _with_kept_budget(newest[0], memories)
         except PastError as error:
             missing.append(f"the uncertainty budget is not known: {error}")
     material = _of(recorded, windows, newest)

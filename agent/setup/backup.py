@@ -33,6 +33,20 @@ class BackupError(Exception):
     """A backup cannot be made. The message names the file and what to do."""
 
 
+def _begin(data_dir: Path, target: Path) -> Path:
+    """Make the directory that becomes `target` when it is complete. Raises BackupError or OSError."""
+    if target.exists():
+        raise BackupError(f"{target}: it exists; name a new directory")
+    if not data_dir.is_dir():
+        raise BackupError(f"{data_dir}: there is no such data directory")
+    partial = target.with_name(target.name + ".partial")
+    try:
+        partial.mkdir(parents=True, mode=0o700)
+    except FileExistsError:
+        raise BackupError(f"{partial}: an earlier backup did not end; remove this directory") from None
+    return partial
+
+
 def back_up(data_dir: Path, target: Path, config_path: Path | None, keys: Iterable[Path]) -> list[Path]:
     """Copy a data directory, and the files that are named, to the new directory `target`; returns the copied files.
 
@@ -43,15 +57,7 @@ def back_up(data_dir: Path, target: Path, config_path: Path | None, keys: Iterab
 
     Raises BackupError or OSError. What was begun is then left beside `target`, with the ending .partial.
     """
-    if target.exists():
-        raise BackupError(f"{target}: it exists; name a new directory")
-    if not data_dir.is_dir():
-        raise BackupError(f"{data_dir}: there is no such data directory")
-    partial = target.with_name(target.name + ".partial")
-    try:
-        partial.mkdir(parents=True, mode=0o700)
-    except FileExistsError:
-        raise BackupError(f"{partial}: an earlier backup did not end; remove this directory") from None
+    partial = _begin(data_dir, target)
     data = partial / DATA
     data.mkdir()
     for path in _regular(path for path in data_dir.iterdir() if _SMALL.fullmatch(path.name)):

@@ -76,9 +76,9 @@ def listen(devices: list[Chosen], asking: Asking) -> None:
     heard = hear(ports) if ports else {}
     for device in waiting:
         told = heard[str(device.value("port"))]
-        if isinstance(told, str) and _ask(device):
-            continue
         if isinstance(told, str):
+            if _ask(device):
+                continue
             asking.faults.append(
                 f"{device.role}: port {device.value('port')}: {told}; connect the device, or state its lines with "
                 f"--{device.role}-option for each of rate_hz, axes, sequence or columns (and baud_rate), or its driver "

@@ -97,18 +97,23 @@ class Guide:
             self._seen[result.sensor].take(result)
         return {sensor: self._next(self._channels[sensor], seen) for sensor, seen in self._seen.items() if seen.status}
 
-    def _next(self, channel: Channel, seen: Seen) -> str:
+    def _of_lost(self, channel: Channel, seen: Seen) -> str:
+        """What to do about devices that are lost; "" where none is."""
         devices = [channel.sensor, *(c.reference for c in channel.by_reference if c.reference)]
         lost = [name for name in devices if name in self._lost]
-        faulty = [name for name in lost if self._lost[name].startswith(IN_DRIVER)]
-        if faulty:
+        if faulty := [name for name in lost if self._lost[name].startswith(IN_DRIVER)]:
             return f"use another version of the driver of {' and '.join(faulty)}, and tell its author of the fault"
-        if lost or seen.status == "INVALID":
-            which = " and ".join(lost or devices[:1])
-            return (
-                f"check power and cable of {which}; its message names the fault. The agent tries again by itself, and "
-                "`fieldcal doctor` names faults too"
-            )
+        if not lost and seen.status != "INVALID":
+            return ""
+        which = " and ".join(lost or devices[:1])
+        return (
+            f"check power and cable of {which}; its message names the fault. The agent tries again by itself, and "
+            "`fieldcal doctor` names faults too"
+        )
+
+    def _next(self, channel: Channel, seen: Seen) -> str:
+        if lost := self._of_lost(channel, seen):
+            return lost
         if seen.on_hold:
             return f"`fieldcal command hold --release --sensor {channel.sensor}` lets the agent use windows again"
         if seen.estimate and (seen.status == "HELD" or channel.gate.policy == "propose"):

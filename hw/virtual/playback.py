@@ -24,17 +24,21 @@ class Track:
     values: list[str]
 
 
+def _lines_of(path: Path) -> list[str]:
+    try:
+        if path.exists() and not path.is_file():
+            raise PlaybackError(f"{path}: not a regular file")
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PlaybackError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
 def read_track(path: Path, columns: tuple[str, ...] | None = None, rate_hz: float | None = None) -> Track:
     """Read the columns to be sent, by default those of sensor.csv or reference.csv as `fieldcal calibrate` reads them.
 
     The times come from the column `time_s`, or from `rate_hz` if it is given. Raises PlaybackError.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise PlaybackError(f"{path}: not a regular file")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PlaybackError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    lines = _lines_of(path)
     header = [name.strip() for name in lines[0].split(",")] if lines else []
     wanted = _wanted(path, header, columns, rate_hz)
     width, places = len(header), [header.index(name) for name in wanted]
@@ -54,13 +58,17 @@ def read_track(path: Path, columns: tuple[str, ...] | None = None, rate_hz: floa
     if rate_hz:
         return Track(np.arange(len(values)) / rate_hz, values)
     time_s = np.array([row[0] for row in numbers])
+    _check_rising(path, time_s)
+    return Track(time_s - time_s[0], values)
+
+
+def _check_rising(path: Path, time_s: NDArray[np.float64]) -> None:
     backwards = np.flatnonzero(np.diff(time_s) < 0)
     if len(backwards):
         at = int(backwards[0]) + 1
         raise PlaybackError(
             f"{path}, sample {at + 1}, column time_s: {time_s[at]} is earlier than {time_s[at - 1]} before it"
         )
-    return Track(time_s - time_s[0], values)
 
 
 def _wanted(path: Path, header: list[str], columns: tuple[str, ...] | None, rate_hz: float | None) -> list[str]:
