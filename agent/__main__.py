@@ -6,14 +6,14 @@ import os
 import sys
 
 from agent.cli.stopping import end_at_once_by_signals
-from agent.delivery.ending import Ending
+from agent.delivery.ending import ProcessEnd
 
 
 def main() -> None:
     """Run the command line; see `fieldcal --help`."""
     if sys.argv[1:2] == ["run"]:
         end_at_once_by_signals()
-    ending = Ending()
+    ending = ProcessEnd()
     # scipy carries its own OpenBLAS beside numpy's; both read this when they load, and sums over another number of
     # threads differ in the last bit.
     os.environ["OPENBLAS_NUM_THREADS"] = "1"

@@ -24,7 +24,7 @@ from benchmarks.online.runner import Run, visits
 from calib.model import Array
 from hw.block import SampleBlock
 from hw.virtual.building import Building
-from hw.virtual.building_motion import Band
+from hw.virtual.building_motion import BuildingSpectrum
 from hw.virtual.schedule import rotation
 
 WINDOWS, EVERY, FIRST = 49, 10, 8  # one of the windows 8, 18, 28, ... contradicts; before, S and the response are found
@@ -86,7 +86,7 @@ def drawn(rate_hz: float, to_hz: float) -> Node:
     made = node(SEED, all_axes=True, stated=Stated(lag_s=0.02), timing=Timing(WINDOW_S, APART_S, WINDOWS))
     p = made.building.parameters
     sensor, reference = (replace(i, clock=replace(i.clock, nominal_rate_hz=rate_hz)) for i in (p.sensor, p.reference))
-    building = Building(replace(p, sensor=sensor, reference=reference, band=Band(0.5, to_hz)), SEED)
+    building = Building(replace(p, sensor=sensor, reference=reference, band=BuildingSpectrum(0.5, to_hz)), SEED)
     return replace(made, building=building, config=building_config(building, **made.stated.keys()))
 
 

@@ -31,7 +31,7 @@ from agent.config.known_keys import add_key
 from agent.delivery.router import router_running
 from agent.fleet.simulated import SITE
 from agent.fleet.simulated_processes import FleetProcesses
-from agent.monitor.engines import Engine, open_engine
+from agent.monitor.engines import DatabaseEngine, open_engine
 from benchmarks.fleet_programs import Asked, Probe, Program, Usage, tree
 from benchmarks.monitor_growth import used_bytes
 from benchmarks.page import machine
@@ -53,7 +53,7 @@ class Counted(NamedTuple):
 class Arrivals(threading.Thread):
     """Counts the results in the database each second, from `nothing` (last number of each gateway) on."""
 
-    def __init__(self, engine: Engine, nothing: dict[str, int], stop: threading.Event) -> None:
+    def __init__(self, engine: DatabaseEngine, nothing: dict[str, int], stop: threading.Event) -> None:
         super().__init__(daemon=True)
         self.counts: list[Counted] = []
         self._engine, self._nothing, self._stop_counting = engine, nothing, stop
@@ -69,18 +69,18 @@ class Arrivals(threading.Thread):
             )
 
 
-def followed(engine: Engine) -> dict[str, int]:
+def followed(engine: DatabaseEngine) -> dict[str, int]:
     """The last result of each gateway in the database."""
     with engine.transaction() as run:
         return dict(run("SELECT gateway, sequence FROM followed WHERE site = :site", site=SITE))
 
 
-def has(engine: Engine, numbers: dict[str, int]) -> bool:
+def has(engine: DatabaseEngine, numbers: dict[str, int]) -> bool:
     """Whether the database has reached these numbers."""
     return followed(engine).items() >= numbers.items()
 
 
-def compared(engine: Engine, after: dict[str, int], last: dict[str, int]) -> tuple[int, int]:
+def compared(engine: DatabaseEngine, after: dict[str, int], last: dict[str, int]) -> tuple[int, int]:
     """(results of the stores after these numbers that the database does not have, results that it has twice)."""
     with engine.transaction() as run:
         rows = run(

@@ -21,14 +21,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.bench.session import Session
-from agent.bench.stops import Stop, on_clamp, turned_by_hand
+from agent.bench.session import BenchSession
+from agent.bench.stops import BenchStop, on_clamp, turned_by_hand
 from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
 from calib.geometry import STANDARD_GRAVITY_MPS2, clamp
 from calib.model import Window
-from calib.visit.next_stop import MAIN, Expected, Wanted
-from calib.visit.stop_order import Together
+from calib.visit.next_stop import MAIN, Expected, WantedUncertainty
+from calib.visit.stop_order import StopSets
 from calib.windows.sums import window_sums
 
 ALPHAS_DEG = tuple(range(0, 360, 15))
@@ -68,7 +68,7 @@ class User:
         S = np.eye(3) + np.where(np.eye(3), U_NOMINAL, U_TRANSVERSE) * random.normal(size=(3, 3))
         return cls(random, S, random.normal(scale=0.5, size=3), ANGLE_DEG * random.normal(), {}, offset_mps2)
 
-    def on_clamp(self, told: Stop, alpha_off_deg: float = 0.0) -> Window:
+    def on_clamp(self, told: BenchStop, alpha_off_deg: float = 0.0) -> Window:
         """The window of a stop on the clamp; `alpha_off_deg`: turned wrong by so much."""
         theta, alpha = told.columns["theta_deg"] + self.theta_deg, told.columns["alpha_deg"] + alpha_off_deg
         key = f"{told.columns['theta_deg']:g} {alpha % 360.0:g}"
@@ -79,7 +79,7 @@ class User:
         u, du = AMPLITUDE_MPS2 * np.sin(omega * t)[:, None], AMPLITUDE_MPS2 * omega * np.cos(omega * t)[:, None]
         return self._window(told, u, du, u @ true.direction.T + true.gravity_mps2, "motion")
 
-    def beside_triad(self, told: Stop) -> Window:
+    def beside_triad(self, told: BenchStop) -> Window:
         """The window of a rest beside the triad, put down within some degrees of what was told."""
         n = round(STAY_S * RATE_HZ)
         felt = told.reference_mps2 + STANDARD_GRAVITY_MPS2 * np.deg2rad(5.0) * self.random.normal(size=3)
@@ -87,7 +87,7 @@ class User:
         u = felt + NOISE_MPS2 * self.random.normal(size=(n, 3))
         return self._window(told, u, np.zeros((n, 3)), np.tile(felt, (n, 1)), "rest")
 
-    def _window(self, told: Stop, u: np.ndarray, du: np.ndarray, a: np.ndarray, kind: str) -> Window:
+    def _window(self, told: BenchStop, u: np.ndarray, du: np.ndarray, a: np.ndarray, kind: str) -> Window:
         n = len(u)
         V = a @ self.S.T + self.Q + self.offset_mps2 * self.random.normal(size=3)
         V = V + NOISE_MPS2 * self.random.normal(size=(n, 3))
@@ -108,7 +108,7 @@ class Ended:
     refused: bool
 
 
-def guided(session: Session, user: User, measure: Callable[[Stop], Window]) -> Ended:
+def guided(session: BenchSession, user: User, measure: Callable[[BenchStop], Window]) -> Ended:
     """One user follows the guide until all is as wanted, or for MOST_STOPS stops."""
     main_stops, promised = 0, session.joint.expanded
     while not session.reached and len(session.windows) < MOST_STOPS:
@@ -125,20 +125,20 @@ def guided(session: Session, user: User, measure: Callable[[Stop], Window]) -> E
     )  # fmt: skip
 
 
-def _session(stops: Sequence[Stop], stated: Priors, wanted: Wanted) -> Session:
+def _session(stops: Sequence[BenchStop], stated: Priors, wanted: WantedUncertainty) -> BenchSession:
     """A session whose motion is known beforehand, as the reference shows it before the first stop."""
-    return Session(
+    return BenchSession(
         stops, stated, wanted, expected=Expected(AMPLITUDE_MPS2 / np.sqrt(2.0), NOISE_MPS2, STAY_S * RATE_HZ)
     )  # fmt: skip
 
 
-def wrong_turns(seed: int, stops: Sequence[Stop], stated: Priors) -> tuple[int, int, int, int]:
+def wrong_turns(seed: int, stops: Sequence[BenchStop], stated: Priors) -> tuple[int, int, int, int]:
     """A user whose clamp is turned wrong once.
 
     Whether a right stop was called wrong, and whether the wrong one was noticed at once, was named, or was found at a
     later stop only.
     """
-    user, session = User.drawn(seed, OFFSET_MPS2), _session(stops, stated, Wanted())
+    user, session = User.drawn(seed, OFFSET_MPS2), _session(stops, stated, WantedUncertainty())
     wrong_at, off = int(user.random.integers(0, 6)), float(user.random.choice(WRONG_DEG))
     refused = noticed = named = later = 0
     for k in range(8):
@@ -182,16 +182,16 @@ def figures(users: int) -> list[str]:
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     two = on_clamp((35.0, 55.0), ALPHAS_DEG, STANDARD_GRAVITY_MPS2, 1)
-    wanted = Wanted()
+    wanted = WantedUncertainty()
     ended: dict[str, list[Ended]] = {"main": [], "all": []}
     for seed in range(users):
-        for name, target in (("main", Wanted(wanted.main, 1.0)), ("all", wanted)):
+        for name, target in (("main", WantedUncertainty(wanted.main, 1.0)), ("all", wanted)):
             user = User.drawn(seed, OFFSET_MPS2)
             ended[name].append(guided(_session(two, stated, target), user, user.on_clamp))
     lines.append(_line("clamp, theta 35 and 55: main", ended["main"], MAIN, 0.05))
     lines.append(_line("clamp, theta 35 and 55: all; the transverse ones", ended["all"], ~MAIN, 0.25))
     lines.append(_line("the same; the main ones", ended["all"], MAIN, 0.05))
-    triad, main = turned_by_hand(np.eye(3), STANDARD_GRAVITY_MPS2), Wanted(wanted.main, 1.0)
+    triad, main = turned_by_hand(np.eye(3), STANDARD_GRAVITY_MPS2), WantedUncertainty(wanted.main, 1.0)
     at_triad = []
     for seed in range(users):
         user = User.drawn(seed, TRIAD_OFFSET_MPS2)
@@ -228,16 +228,16 @@ def outlooks() -> list[str]:
     triad = turned_by_hand(np.eye(3), STANDARD_GRAVITY_MPS2)
     clamped = {"theta_rad": angle, "angle_rad": angle}
     cases = (
-        ("one inclination, theta 35", one, priors(OFFSET_MPS2, **clamped), Wanted()),
+        ("one inclination, theta 35", one, priors(OFFSET_MPS2, **clamped), WantedUncertainty()),
         (
             "common alpha known to 0.1 deg",
             two,
             priors(OFFSET_MPS2, **clamped, alpha_common_rad=float(np.deg2rad(0.1))),
-            Wanted(),
+            WantedUncertainty(),
         ),
-        ("rests beside a triad, offsets 2.5 mm/s²", triad, priors(0.0025), Wanted(5e-4, 1.0)),
-        ("rests beside a triad, offsets 5 mm/s²", triad, priors(0.005), Wanted(5e-4, 1.0)),
-        ("rests beside a triad, offsets 50 mm/s²", triad, priors(0.05), Wanted(5e-4, 1.0)),
+        ("rests beside a triad, offsets 2.5 mm/s²", triad, priors(0.0025), WantedUncertainty(5e-4, 1.0)),
+        ("rests beside a triad, offsets 5 mm/s²", triad, priors(0.005), WantedUncertainty(5e-4, 1.0)),
+        ("rests beside a triad, offsets 50 mm/s²", triad, priors(0.05), WantedUncertainty(5e-4, 1.0)),
     )
     lines = [
         "\n| what the guide says beforehand | stops | U then, % main / transverse | never below, % | because of |",
@@ -262,8 +262,8 @@ def bounds() -> list[str]:
         "| --- | --- | --- | --- |",
     ]
     for name, stops, stated in (("clamp", two, clamped), ("triad", triad, priors(TRIAD_OFFSET_MPS2))):
-        session = _session(stops, stated, Wanted(Wanted().main, 1.0))
-        together = Together(session.plan, session.joint, session.expected, session.wanted)
+        session = _session(stops, stated, WantedUncertainty(WantedUncertainty().main, 1.0))
+        together = StopSets(session.plan, session.joint, session.expected, session.wanted)
         for count in (4, 5):
             every = itertools.combinations(range(len(stops)), count)
             best, found = (100.0 * u[MAIN].max() for _, u in (together.of(every), together.best(range(count))))

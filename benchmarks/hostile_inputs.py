@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.store import Store
 from agent.export.cdr import DEFINITIONS, IMU, imu
 from tests.replay.golden_files import FORMATS, RECORDING
@@ -139,7 +139,7 @@ def _fill(data_dir: Path) -> None:
     results = [
         made(number) for number, made in enumerate((window, status, calibration) * 3, start=store.last_sequence() + 1)
     ]
-    store.commit([Record.of(result, recorded=True, recording=RECORDING) for result in results])
+    store.commit([StoredResult.of(result, recorded=True, recording=RECORDING) for result in results])
     store.close()
 
 

@@ -17,7 +17,7 @@ from agent.delivery.keys import Address
 from agent.delivery.received import Received
 from agent.fleet.simulated_sensor import SimulatedSensor, Story
 from agent.monitor.database import DAY_NS, Database
-from agent.monitor.engines import Engine, open_engine
+from agent.monitor.engines import DatabaseEngine, open_engine
 from agent.monitor.summaries import FULL_DAYS
 
 MINUTE_NS = 60_000_000_000
@@ -70,7 +70,7 @@ def drawn(name: str, seed: list[int]) -> list[list[Result]]:
     return rounds[1:]
 
 
-def used_bytes(engine: Engine, url: str | None) -> int:
+def used_bytes(engine: DatabaseEngine, url: str | None) -> int:
     """Bytes in use: free pages of SQLite are used again."""
     with engine.transaction() as run:
         if url is None:

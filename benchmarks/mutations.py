@@ -28,7 +28,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from agent.cli.given import read_head
 from agent.config.known_keys import KnownKeys
 from agent.recording.head import HEAD_NAME
-from agent.recording.records import RecordError
+from agent.recording.records import FileRecordError
 from agent.recording.result_signing import PUBLIC_KEY
 from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS
 from agent.recording.signing import SIGNATURE_METADATA
@@ -189,7 +189,7 @@ def bare(data: Path) -> None:
     for path in files_of(data):
         try:
             found = Unpacked.of(path)
-        except RecordError:  # a truncated file stays as it is
+        except FileRecordError:  # a truncated file stays as it is
             continue
         found.metadata = [(name, dict(values)) for name, values in found.metadata if name != SIGNATURE_METADATA]
         for _, values in (entry for entry in found.metadata if entry[0] == FILE_METADATA):

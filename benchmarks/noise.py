@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agent.core.noise_watch import FIRST, Noise
+from agent.core.noise_watch import FIRST, NoiseHistory
 from benchmarks.page import machine, write_part
 from calib.model import Array
 
@@ -63,7 +63,7 @@ def drawn(random: np.random.Generator, sound: Sound, times: Array) -> Iterator[t
 
 def told(random: np.random.Generator, sound: Sound, times: Array) -> list[int]:
     """The numbers of the windows at which something is told."""
-    watch = Noise()
+    watch = NoiseHistory()
     windows = enumerate(drawn(random, sound, times))
     return [k for k, (motion, noise) in windows if watch.update(float(np.log(motion)), np.log(noise))]
 

@@ -30,7 +30,7 @@ from agent.engine import identity
 from agent.proto import fieldcal_pb2 as pb
 from agent.recording.files import RecordingFile
 from agent.recording.integrity import check_integrity
-from agent.recording.limits import Budget
+from agent.recording.limits import UsedLimits
 from agent.recording.messages import decode, schema_of
 from agent.recording.raw_block import encode_block
 from agent.recording.reading import RecordingReader
@@ -100,7 +100,7 @@ def chunks(path: Path) -> list[list[Item]]:
         for record in walk(file, path.stat().st_size):
             if record.name == "Chunk":
                 found.append([])
-                for part in content(record, unpack(record, Budget()), Budget()):
+                for part in content(record, unpack(record, UsedLimits()), UsedLimits()):
                     if isinstance(part, ChunkMessage):
                         topic = topics[part.channel_id]
                         _, item = decode(schema_of(topic), part.data)
@@ -132,7 +132,7 @@ def parts(path: Path) -> dict[str, int]:
         for record in walk(file, path.stat().st_size):
             size = record.end - record.offset
             if record.name == "Chunk":
-                chunk = unpack(record, Budget())
+                chunk = unpack(record, UsedLimits())
                 outside["compressed content of chunks"] += chunk.compressed_size
                 outside["heads of chunks"] += size - chunk.compressed_size
             elif record.name == "MessageIndex":

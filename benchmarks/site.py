@@ -27,7 +27,7 @@ from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
 from calib.model import Pose, Window, WindowSums
 from calib.site_adjustment.contradiction import FALSE_ALARM, suspects, verdicts
-from calib.site_adjustment.device import Device
+from calib.site_adjustment.device import SiteDevice
 from calib.site_adjustment.link import Link, link
 from calib.site_adjustment.site import Site
 from tests.dense_site import RATE_HZ, SAMPLES, SimulatedSite, Stated, turned
@@ -63,10 +63,10 @@ def simulated(seed: int) -> tuple[SimulatedSite, list[Link]]:
     return site, links
 
 
-def devices_of(sensors: int, references: int, u: float) -> list[Device]:
+def devices_of(sensors: int, references: int, u: float) -> list[SiteDevice]:
     """What is known of them."""
-    return [Device.reference(f"r{k}", u, 3) for k in range(references)] + [
-        Device.known(f"s{k}", NOMINAL, PRIOR) for k in range(sensors)
+    return [SiteDevice.reference(f"r{k}", u, 3) for k in range(references)] + [
+        SiteDevice.known(f"s{k}", NOMINAL, PRIOR) for k in range(sensors)
     ]
 
 

@@ -30,7 +30,7 @@ from benchmarks.beam_world import BANDS_HZ, FREQUENCY_HZ, Bridge, Damage, World,
 from benchmarks.page import machine, write_part
 from calib.model import Array
 from calib.site_watch.day import Hours, day_of
-from calib.site_watch.verdicts import Result, result
+from calib.site_watch.verdicts import SiteVerdicts, result
 from calib.site_watch.watch import SiteWatch
 
 GATEWAYS = {8: 3, 30: 5, 200: 10}
@@ -58,7 +58,7 @@ def learned(seed: int, sensors: int, world: World) -> tuple[Bridge, SiteWatch]:
     return bridge, watch
 
 
-def told_after(watch: SiteWatch, days: Iterable[Hours], looks: tuple[int, ...]) -> list[Result]:
+def told_after(watch: SiteWatch, days: Iterable[Hours], looks: tuple[int, ...]) -> list[SiteVerdicts]:
     """The results after so many days, from a copy of the watch on."""
     watch, found = SiteWatch.loaded(copy.deepcopy(watch.snapshot())), []
     for number, hours in enumerate(days, start=1):
@@ -68,7 +68,7 @@ def told_after(watch: SiteWatch, days: Iterable[Hours], looks: tuple[int, ...]) 
     return found
 
 
-def named(found: Result) -> list[int]:
+def named(found: SiteVerdicts) -> list[int]:
     """Sensors that are said to have changed; -1 for each gateway."""
     return [i for i, told in enumerate(found.sensors) if told.kind in ALARMS] + [-1] * len(found.gateways)
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from agent.core.events import CalibrationUpdate
 from agent.delivery.consumer import Consumer
-from agent.delivery.history import FILE_NAME, History, Record
+from agent.delivery.history import FILE_NAME, History, StoredResult
 from benchmarks.fast_serial import environment
 from benchmarks.page import machine, write_part
 from hw.virtual.bench import Bench
@@ -67,7 +67,7 @@ class Soaked:
     hours: float
     samples: list[Sample]
     lost_bytes: int
-    kept: list[Record]
+    kept: list[StoredResult]
     received: list[int]
     worst_error_pct: float
     exit_status: int | None
@@ -191,7 +191,7 @@ def _watched(agent: subprocess.Popen[bytes], duration_s: float) -> Iterator[Samp
         time.sleep(min(SAMPLE_S, max(0.1, duration_s / 100)))
 
 
-def _worst_error(bench: Bench, kept: list[Record]) -> float:
+def _worst_error(bench: Bench, kept: list[StoredResult]) -> float:
     """Largest error of any main sensitivity in any calibration, %."""
     truth = np.diag(bench.truth.sensitivity)
     updates = [r.result for r in kept if r.what == "calibration"]

@@ -14,7 +14,7 @@ from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.resampling import differentiate, resample
 from calib.signal.stamps import clock_from_stamps
 from calib.windows.sums import window_sums
-from hw.virtual.bench import Recording
+from hw.virtual.bench import BenchRecording
 from hw.virtual.schedule import PoseInterval
 
 LAG_LEFT_S = 2e-5  # a smaller lag changes S by less than (omega tau)^2 / 2 = 3e-7 at 6 Hz
@@ -22,7 +22,7 @@ CORNER_LEFT_HZ = 1e-3  # a smaller corner changes S by less than (c / omega)^2 /
 PASSES = 4
 
 
-def adjusted(recording: Recording, priors: Priors, velocity: bool) -> Adjustment:
+def adjusted(recording: BenchRecording, priors: Priors, velocity: bool) -> Adjustment:
     """Solve, correct for the lag and the corner that were found, and repeat until they are negligible."""
     sensor = clock_from_stamps(recording.sensor_stamp_s)
     reference = clock_from_stamps(recording.reference_stamp_s)
@@ -53,7 +53,7 @@ def adjusted(recording: Recording, priors: Priors, velocity: bool) -> Adjustment
     return found
 
 
-def plain(recording: Recording, velocity: bool) -> np.ndarray:
+def plain(recording: BenchRecording, velocity: bool) -> np.ndarray:
     """Method 3 as printed, with the stamps as they are: no clock model, no lag, all points."""
     reference = recording.reference
     if velocity:

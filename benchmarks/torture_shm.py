@@ -30,7 +30,7 @@ from calib.model import Window
 from calib.paper.method3 import fit
 from calib.recorded.streams import TableStream
 from calib.signal.instrument import Instrument
-from hw.virtual.bench import Bench, Recording
+from hw.virtual.bench import Bench, BenchRecording
 from hw.virtual.motion import ambient
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
 from hw.virtual.schedule import Schedule, directed
@@ -69,7 +69,7 @@ def one(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     return naive.ravel() - S_TRUE.ravel(), found.mean[:9] - S_TRUE.ravel(), u, found.coverage_factor
 
 
-def windows(recording: Recording, settings: Settings) -> list[Window]:
+def windows(recording: BenchRecording, settings: Settings) -> list[Window]:
     """All windows of a recording, made by the front end."""
     sensor = TableStream("sensor", recording.sensor_stamp_s, recording.v)
     reference = TableStream("reference", recording.reference_stamp_s, recording.reference)

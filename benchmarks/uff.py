@@ -22,21 +22,21 @@ def measure(count: int) -> None:
 
     import numpy as np
 
-    from agent.export.samples import Content, Samples
+    from agent.export.samples import ExportedSamples, RecordedContent
     from agent.export.uff import write_uff
     from tests.unit.results import calibration
 
     random = np.random.default_rng(1)
 
-    def blocks() -> Iterator[Samples]:
+    def blocks() -> Iterator[ExportedSamples]:
         for first in range(0, count, BLOCK):
             times = 1_700_000_000 * 10**9 + (np.arange(first, first + BLOCK) * 1e9 / RATE_HZ).astype(np.int64)
             values = random.integers(-(1 << 19), 1 << 19, (BLOCK, 3)).astype(float)
-            yield Samples(times, values, values / 26000.0, first, RATE_HZ, None)
+            yield ExportedSamples(times, values, values / 26000.0, first, RATE_HZ, None)
 
     with tempfile.TemporaryDirectory() as directory:
         path, begun = Path(directory) / "a.uff", time.process_time()
-        write_uff(path, Content("mems", "count", 3, [calibration(1)]), blocks())
+        write_uff(path, RecordedContent("mems", "count", 3, [calibration(1)]), blocks())
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         size_mb, took_s = path.stat().st_size / 1e6, time.process_time() - begun
     print(f"| {count} | {size_mb:.0f} | {took_s:.1f} | {peak_mb:.0f} |", flush=True)

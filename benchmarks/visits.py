@@ -26,13 +26,13 @@ import numpy as np
 from agent.bench.capture import DeviceSamples
 from agent.bench.clamp_words import findings
 from agent.bench.kinds import mounted, stated, write_prior
-from agent.bench.measuring import Measuring, Record, Taken
+from agent.bench.measuring import Measuring, Record, StopInterval
 from agent.bench.visiting import looked
 from agent.calibrate.stated import options_of
 from agent.cli.led import parsed
 from agent.config import Channel, parse_config
 from benchmarks.page import machine, write_part
-from calib.visit.next_stop import MAIN, Wanted
+from calib.visit.next_stop import MAIN, WantedUncertainty
 from hw.virtual.visits import RATE_HZ, REFERENCE, Clamped, Structure, StructureParameters
 
 SENSOR = "sensor-1"
@@ -90,9 +90,9 @@ class Visit:
             found[name] = DeviceSamples(np.repeat(arrived, BURST), self.structure.values(k, 0, n), np.full(n, 20.0))
         return found
 
-    def taken(self, seconds: float) -> Taken:
+    def taken(self, seconds: float) -> StopInterval:
         """All of it but the ends."""
-        return Taken(mounted(self.channel), EDGE_S, seconds - EDGE_S)
+        return StopInterval(mounted(self.channel), EDGE_S, seconds - EDGE_S)
 
     def relative_error(self, sensitivity: np.ndarray) -> np.ndarray:
         """(9,) errors of S over the main sensitivities."""
@@ -102,7 +102,7 @@ class Visit:
 
 def kept(visits: int, level_mps2: float) -> str:
     """U over twice the RMS error, and the promised time over the time that it took, for clamps that are fine."""
-    wanted = Wanted(WANTED_PCT[level_mps2] / 100.0, np.inf)
+    wanted = WantedUncertainty(WANTED_PCT[level_mps2] / 100.0, np.inf)
     errors, told, times = [], [], []
     for seed in range(visits):
         visit, seconds = Visit.drawn(seed, Clamped(), level_mps2), LOOKED_S
@@ -144,7 +144,9 @@ def named(visits: int, u_transverse: float) -> list[str]:
         for seed in range(visits):
             this = replace(way, turned_deg=TURNED_DEG * axes[seed % 6]) if kind == "turned" else way
             visit = Visit.drawn(seed, this, u_transverse=u_transverse)
-            look = looked(visit.measuring, Wanted(0.005, np.inf), visit.record(LOOKED_S), visit.taken(LOOKED_S))
+            look = looked(
+                visit.measuring, WantedUncertainty(0.005, np.inf), visit.record(LOOKED_S), visit.taken(LOOKED_S)
+            )
             said[", ".join(sorted(findings(look.clamp, SENSOR))) if look.clamp else "nothing seen"] += 1
         right = said.pop(kind, 0)
         rest = ", ".join(f"{count} {what or 'nothing'}" for what, count in said.items()) or "-"

@@ -29,7 +29,7 @@ from agent.core.estimation import Estimation
 from calib.drift.drift import DriftVerdict
 from calib.estimate.quantities import YEAR_DAYS
 from calib.geometry import STANDARD_GRAVITY_MPS2
-from calib.state.walks import LONGEST_DAYS, Shown, Walks
+from calib.state.walks import LONGEST_DAYS, ReferenceView, Walks
 from calib.windows.record import Record
 from tests.building_windows import building_window
 
@@ -235,7 +235,7 @@ def alarms(runs: int) -> None:
         walks = Walks(rate)
         makers = [{f"{p}": (1.0, 1.0), "r": (1.0, 1.0)} for p in range(12)]
         for day, value in enumerate(values):
-            shown = Shown(float(day), value, zero, zero, a_day, zero, zero, makers, True)
+            shown = ReferenceView(float(day), value, zero, zero, a_day, zero, zero, makers, True)
             told += len([v for v in walks.update({"A": shown}) if v.verdict == "drifting"])
             wide += bool(walks.widened)
             if walks.drifting:

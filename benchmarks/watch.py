@@ -2,7 +2,7 @@
 
     python -m benchmarks.watch [--rate-hz 1000] [--minutes 5]
 
-Blocks of half a second go through `agent.core.watch.Watch` alone; the time of a whole run without it is that of
+Blocks of half a second go through `agent.core.watch.SensorWatch` alone; the time of a whole run without it is that of
 `benchmarks.agent_cost`. The share is CPU time over the time of the data. Kept: what the channel holds when its hour and
 its minute are full, in the snapshot. The memory for a moment is what tracemalloc sees above that; channels take turns,
 so that it is needed once for all of them.
@@ -18,7 +18,7 @@ import tracemalloc
 import numpy as np
 
 from agent.core.snapshot import pack
-from agent.core.watch import Watch
+from agent.core.watch import SensorWatch
 from calib.estimate.correction import Law
 from calib.signal.spectra import bands_of
 from hw.block import BlockFlags, SampleBlock
@@ -49,12 +49,12 @@ def main() -> int:
     options = parser.parse_args()
     made = blocks(options.rate_hz, options.minutes)
     bands_of(options.rate_hz)
-    watch, began_s = Watch(), time.process_time()
+    watch, began_s = SensorWatch(), time.process_time()
     for block in made:
         watch.update(block, SOUND, LAW)
     share = (time.process_time() - began_s) / (60.0 * options.minutes)
     tracemalloc.start()
-    watch = Watch()
+    watch = SensorWatch()
     for block in made:
         watch.update(block, SOUND, LAW)
     now, at_once = tracemalloc.get_traced_memory()

@@ -17,7 +17,7 @@ _WRITTEN = {"uV": "µV", "ug": "µg"}
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class DisplayUnits:
     """The units in which people read S and Q. `factors` (12,): S row by row and Q in these units for 1 in the result's.
 
     The unit of S is "1" where it has no dimension.
@@ -39,12 +39,12 @@ def written(unit: str) -> str:
     return _WRITTEN.get(unit, unit.replace("/s^2", "/s²").replace("/s2", "/s²")) or "output unit"
 
 
-def shown_in(unit: str) -> Shown:
+def shown_in(unit: str) -> DisplayUnits:
     """How S and Q of an output in `unit` are shown: as they are, but S in g/g and Q in mg where the output is in g."""
     name = written(unit)
     if (one_g := G_IN.get(name)) is not None:
-        return Shown(IN_G, "mg", _factors(STANDARD_GRAVITY_MPS2 / one_g, G_IN["mg"] / one_g))
-    return Shown("1" if name == ACCELERATION else f"{name}/({ACCELERATION})", name, _factors(1.0, 1.0))
+        return DisplayUnits(IN_G, "mg", _factors(STANDARD_GRAVITY_MPS2 / one_g, G_IN["mg"] / one_g))
+    return DisplayUnits("1" if name == ACCELERATION else f"{name}/({ACCELERATION})", name, _factors(1.0, 1.0))
 
 
 def _factors(of_sensitivity: float, of_offset: float) -> Array:

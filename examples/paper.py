@@ -18,7 +18,7 @@ from paper_reproduced.faults import AMPLITUDE_MPS2, FREQUENCIES_HZ, STATED, alon
 from paper_reproduced.monte_carlo import monte_carlo
 from paper_reproduced.page import Findings, page
 
-from calib.paper.amplitudes import Run
+from calib.paper.amplitudes import SineRun
 from calib.paper.sine_fit import four_parameter
 
 SEED = 2018
@@ -56,12 +56,12 @@ def main() -> None:
     print(f"{docs / 'paper.md'} and its figures written in {time.perf_counter() - started:.1f} s")
 
 
-def draw(folder: Path, found: list[Comparison], at: dict[str, dict[int, Comparison]], runs: list[Run]) -> None:
+def draw(folder: Path, found: list[Comparison], at: dict[str, dict[int, Comparison]], runs: list[SineRun]) -> None:
     """Write all figures as SVG into `folder`."""
     run = next(r for r in runs if r.pose.position == "method 3, 30 deg")
     period = slice(0, ONE_PERIOD)
     a_ref = four_parameter(run.time_s, run.reference).derivative(run.time_s)[period, 0]
-    first = Run(run.time_s[period], run.reference[period], run.indications[period], run.pose, run.quantity)
+    first = SineRun(run.time_s[period], run.reference[period], run.indications[period], run.pose, run.quantity)
     figures.save(figures.figure_2(first, a_ref, MEMS.unit), folder / "figure-2.svg")
     for device in DEVICES:
         figures.save(figures.rows_of_s(device, at[device.key]), folder / f"rows-{device.key}.svg")

@@ -18,7 +18,7 @@ LONGEST_S = 30.0  # of one axis that waits for the others; also the longest gap 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Together:
+class AlignedSamples:
     """Samples (n, axes) of all axes, the time of the first one, and what lies before it."""
 
     start_ns: int
@@ -28,7 +28,7 @@ class Together:
 
 
 @dataclass(slots=True, eq=False)
-class _Run:
+class _AxisRun:
     start_ns: int
     samples: Samples
 
@@ -49,7 +49,7 @@ class Alignment:
 
     def restart(self) -> None:
         """Forget all samples that wait; the next ones carry RESTART."""
-        self._waiting: list[deque[_Run]] = [deque() for _ in range(self._axes)]
+        self._waiting: list[deque[_AxisRun]] = [deque() for _ in range(self._axes)]
         self._ends_ns: list[float | None] = [None] * self._axes
         self._end_ns: float | None = None
 
@@ -64,11 +64,11 @@ class Alignment:
             return
         self._ends_ns[axis] = start_ns + len(samples) * self._period_ns
         runs = self._waiting[axis]
-        runs.append(_Run(start_ns, samples))
+        runs.append(_AxisRun(start_ns, samples))
         while sum(len(run.samples) for run in runs) > max(self._most, len(samples)):
             self.alone += len(runs.popleft().samples)
 
-    def take(self) -> Iterator[Together]:
+    def take(self) -> Iterator[AlignedSamples]:
         """The samples that all axes have, in the order of their times; each part has no gap inside."""
         while all(self._waiting):
             start_ns = max(runs[0].start_ns for runs in self._waiting)
@@ -81,16 +81,16 @@ class Alignment:
             columns = [self._first(runs, n) for runs in self._waiting]
             flags, missing = self._before(start_ns)
             self._end_ns = start_ns + n * self._period_ns
-            yield Together(start_ns, cast(Samples, np.stack(columns, axis=1)), flags, missing)
+            yield AlignedSamples(start_ns, cast(Samples, np.stack(columns, axis=1)), flags, missing)
 
-    def _skip(self, runs: deque[_Run], start_ns: int) -> None:
+    def _skip(self, runs: deque[_AxisRun], start_ns: int) -> None:
         """Discard the samples before `start_ns`."""
         while runs and (early := round((start_ns - runs[0].start_ns) / self._period_ns)) > 0:
             n = min(early, len(runs[0].samples))
             self.alone += n
             self._first(runs, n)
 
-    def _first(self, runs: deque[_Run], n: int) -> Samples:
+    def _first(self, runs: deque[_AxisRun], n: int) -> Samples:
         """Take the first `n` samples of the first run."""
         run = runs[0]
         taken, run.samples = run.samples[:n], run.samples[n:]

@@ -41,7 +41,7 @@ class Icm20948Options(FifoOptions):
         return chip.filters(self.rate_hz)
 
 
-class _Device(BankedDevice):
+class _Icm20948(BankedDevice):
     bank_select, bank_unit, banks = chip.BANK_SELECT, 0x10, range(4)
 
 
@@ -54,7 +54,7 @@ class Icm20948(BankedSensor):
     """
 
     options_model = Icm20948Options
-    device_class = _Device
+    device_class = _Icm20948
     identity_register, identity = chip.WHO_AM_I, chip.IDENTITY
     word_bytes = chip.SAMPLE_BYTES
 

@@ -40,7 +40,7 @@ class Icm42688Options(FifoOptions):
         return chip.filters(self.rate_hz)
 
 
-class _Device(BankedDevice):
+class _Icm42688(BankedDevice):
     bank_select, bank_unit, banks = chip.BANK_SELECT, 1, range(5)
 
 
@@ -53,7 +53,7 @@ class Icm42688(BankedSensor):
     """
 
     options_model = Icm42688Options
-    device_class = _Device
+    device_class = _Icm42688
     identity_register, identity = chip.WHO_AM_I, chip.IDENTITY
     word_bytes = chip.PACKET_BYTES
 

@@ -33,7 +33,7 @@ class RecordError(Exception):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Record:
+class MiniseedRecord:
     """Samples (n,) of one channel, NETWORK.STATION.LOCATION.CHANNEL; `start_ns` is UTC of the first one."""
 
     channel: str
@@ -42,7 +42,7 @@ class Record:
     samples: NDArray[np.int32] | NDArray[np.float64]
 
 
-def decode(data: bytes) -> Record:
+def decode(data: bytes) -> MiniseedRecord:
     """Decode one record of RECORD_BYTES. Raises RecordError, and nothing else, whatever the bytes are."""
     if len(data) != RECORD_BYTES:
         raise RecordError(f"{len(data)} bytes, not {RECORD_BYTES}")
@@ -61,7 +61,7 @@ def decode(data: bytes) -> Record:
     late = 0 if activity & TIME_CORRECTED else correction
     start_ns += (fraction + late) * 100_000 + microseconds * 1000
     samples = _samples(data[begin:], encoding, ">" if big else "<", count)
-    return Record(names, start_ns, _rate_hz(factor, multiplier), samples)
+    return MiniseedRecord(names, start_ns, _rate_hz(factor, multiplier), samples)
 
 
 def _text(data: bytes) -> str:

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator
 
 from hw import miniseed
 from hw.block import DeviceInfo
-from hw.seedlink_link import Link
+from hw.seedlink_link import SeedLinkConnection
 from hw.sensor import DeviceLost, Options
 from hw.stamped_sensor import StampedSensor
 
@@ -62,7 +62,7 @@ class Seedlink(StampedSensor):
 
     options_model: ClassVar[type[Options]] = SeedlinkOptions
 
-    _link: Link | None = None
+    _link: SeedLinkConnection | None = None
 
     def _where(self) -> str:
         o = self._options
@@ -71,7 +71,7 @@ class Seedlink(StampedSensor):
     def _connect(self) -> DeviceInfo:
         o = self._options
         self._axis = {f"{o.network}.{o.station}.{o.location}.{channel}": k for k, channel in enumerate(o.channels)}
-        self._link = Link(self._where(), self._clock, self._sleep)
+        self._link = SeedLinkConnection(self._where(), self._clock, self._sleep)
         selectors = [f"{o.location}{channel}.D" for channel in o.channels]
         self._link.connect(o.host, o.port, o.station, o.network, selectors)
         self._align()

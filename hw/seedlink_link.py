@@ -22,7 +22,7 @@ LONGEST_ANSWER = 1024  # bytes
 KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
 
 
-class Link:
+class SeedLinkConnection:
     """One connection. `where` names the station and the server in messages."""
 
     def __init__(self, where: str, clock: Clock, sleep: Callable[[float], None]) -> None:

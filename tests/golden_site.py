@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agent.config import Config, parse_config
 from hw.block import DeviceInfo
-from hw.virtual.building_motion import Band, BuildingMotion
+from hw.virtual.building_motion import BuildingMotion, BuildingSpectrum
 from hw.virtual.timebase import Bursts
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ RATE_HZ = 100.0
 WINDOW_S, GUARD_S = 6.0, 0.5
 LEVEL_MPS2, NOISE_MPS2 = 0.6, {SENSOR: 0.03, REFERENCE: 0.001}
 LONGEST_S = 600.0  # of the motion
-BAND = Band(0.5, 4.0, flat=1.0)  # slow, because the stamps of a busy machine may be off by milliseconds
+BAND = BuildingSpectrum(0.5, 4.0, flat=1.0)  # slow, because the stamps of a busy machine may be off by milliseconds
 LATE = Bursts(poll_s=0.018, mean_late_s=0.002, stall_probability=0.05, longest_stall_s=0.05)  # as on such a machine
 U_LAG_WINDOW_S = 0.002
 DECIMALS = 4

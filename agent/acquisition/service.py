@@ -23,7 +23,7 @@ from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStar
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
 from agent.delivery.gateway_key import GatewayKey
-from agent.delivery.history import Record, StoreError
+from agent.delivery.history import StoredResult, StoreError
 from agent.delivery.mqtt import MqttPublisher
 from agent.delivery.publication import Publisher
 from agent.delivery.retention import keep_results
@@ -38,10 +38,10 @@ from agent.recording.retention import keep_files
 from agent.recording.signing import Signer
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
-from agent.supervision.notify import Notifier
+from agent.supervision.notify import SystemdNotifier
 from agent.supervision.plant import Outbox, Plant
 from agent.supervision.supervisor import Supervisor
-from agent.terminal.watch import Watch
+from agent.terminal.watch import RunView
 from hw.sensor import boot_id
 
 _log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ READER_STOP_S = 0.7  # s to wait for readers at the end; a reader ends within on
 class Service:
     """One run of the agent. `stop` may be called from a signal handler; `run` returns after all files are closed."""
 
-    def __init__(self, config: Config, data_dir: Path, watch: Watch) -> None:
+    def __init__(self, config: Config, data_dir: Path, watch: RunView) -> None:
         self._config = config
         self._data_dir = data_dir
         self._watch = watch
@@ -116,7 +116,7 @@ class Service:
         self._begin()
         writer = RecordingThread(self._recorder, self._deliver, flush_s=config.recording.flush_s)
         plant = Plant(self._data_dir, events, writer, self._recorder, Outbox(self._store), self._publisher, self._mqtt)
-        self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, Notifier(os.environ))
+        self._supervisor = Supervisor(config, self._run_id, self._origin_ns, plant, SystemdNotifier(os.environ))
         for channel in config.channels:
             self._supervisor.remember(plant.outbox.drifts(channel.sensor))
         self.begun = True
@@ -274,7 +274,7 @@ class Service:
         name, epoch = final_name(path) if path else "", self._store.epoch
         signed = [self._recorder.results.signed(event_sequence, result) for result in results]
         records = [
-            Record.of(result, recorded=recorded, recording=name, epoch=epoch, signed=one.data if one else b"")
+            StoredResult.of(result, recorded=recorded, recording=name, epoch=epoch, signed=one.data if one else b"")
             for result, one in zip(results, signed, strict=True)
         ]
         try:

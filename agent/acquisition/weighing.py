@@ -24,7 +24,7 @@ STILL_MPS2 = 1.0  # an AC-coupled reference, which does not feel gravity, has a 
 
 
 @dataclass(slots=True)
-class _Sum:
+class _SampleSums:
     """The samples of one device so far."""
 
     total: Array
@@ -36,7 +36,7 @@ class Weighing:
 
     def __init__(self, config: Config) -> None:
         self._channels = config.channels
-        self._sums: dict[str, _Sum] = {}
+        self._sums: dict[str, _SampleSums] = {}
         self._nominal: dict[str, float | None] = {}
 
     def told(self, event: Event) -> list[str]:
@@ -45,7 +45,7 @@ class Weighing:
             info = json.loads(event.info_json)
             self._nominal[event.device] = nominal_of(info)
             if info["axes"] == 3:
-                self._sums[event.device] = _Sum(np.zeros(3))
+                self._sums[event.device] = _SampleSums(np.zeros(3))
         if not isinstance(event, SampleBlock) or (held := self._sums.get(event.device)) is None:
             return []
         held.total += event.indications.sum(axis=0)

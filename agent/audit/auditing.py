@@ -16,11 +16,11 @@ import msgspec
 from agent.audit.departure import Departure
 from agent.audit.replaying import Replayed, ReplayedFile, Replayer
 from agent.engine import identity
-from agent.recording.chain import Link
+from agent.recording.chain import ChainLink
 from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.pruned_ranges import LIST, PRUNED_METADATA, Deleted, from_metadata
 from agent.recording.reading import REPAIR_METADATA, open_recording
-from agent.recording.records import Fault
+from agent.recording.records import FileFault
 from agent.recording.repair import UNSIGNED
 from agent.recording.result_check import check_results
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS
@@ -49,7 +49,7 @@ class AuditedFile(msgspec.Struct, kw_only=True):
     size: int
     sha256: str
     good_bytes: int
-    faults: list[Fault]  # the first ones of `fault_count` faults
+    faults: list[FileFault]  # the first ones of `fault_count` faults
     fault_count: int
     chunks: int
     messages: int
@@ -63,7 +63,7 @@ class Audited:
 
     verdict: AuditedFile
     replayed: Replayed
-    link: Link
+    link: ChainLink
 
 
 def audit_file(
@@ -159,9 +159,9 @@ def _unread(replay: ReplayedFile) -> bool:
     return replay.undecoded and replay.engine != identity.name()
 
 
-def _link(verdict: AuditedFile, integrity: Integrity) -> Link:
+def _link(verdict: AuditedFile, integrity: Integrity) -> ChainLink:
     pruned = integrity.metadata.get(PRUNED_METADATA)
-    return Link(
+    return ChainLink(
         path=verdict.path,
         gateway=verdict.replay.gateway,
         epoch=integrity.metadata.get(FILE_METADATA, {}).get(EPOCH, ""),

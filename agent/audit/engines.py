@@ -16,7 +16,7 @@ from agent.engine.known import find_engine, known_engines
 from agent.engine.process import EngineProcess, EngineResults
 from agent.engine.wheel import EngineWheel
 from agent.recording.messages import MessageError, decode
-from agent.recording.reading import Step
+from agent.recording.reading import RecordedStep
 
 MOST_TRIED = 32  # engines that are tried for a file that names none
 
@@ -74,10 +74,10 @@ class _EngineOfWheel:
         self.name = name
         self._process = process
 
-    def begin(self, step: Step) -> list[Output]:
+    def begin(self, step: RecordedStep) -> list[Output]:
         return _decoded(step, self._process.begin(step.schema, step.data))
 
-    def step(self, step: Step) -> list[Output]:
+    def step(self, step: RecordedStep) -> list[Output]:
         return _decoded(step, self._process.step(step.schema, step.data))
 
     def snapshot(self) -> bytes:
@@ -93,7 +93,7 @@ def _process(wheel: EngineWheel) -> Iterator[_EngineOfWheel]:
         yield _EngineOfWheel(wheel.name, process)
 
 
-def _decoded(step: Step, results: EngineResults) -> list[Output]:
+def _decoded(step: RecordedStep, results: EngineResults) -> list[Output]:
     """The results of an engine. Raises MessageError where they are none."""
     items = [decode(schema, data) for schema, data in results.messages]
     if not all(number == step.event_sequence and isinstance(item, Output) for number, item in items):

@@ -23,24 +23,24 @@ from agent.engine.process import EngineError
 from agent.recording.comparison import Difference, compare
 from agent.recording.continuation import UNKEPT_MAX, continues, left
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
-from agent.recording.reading import RecordingReader, Step
-from agent.recording.records import Fault
+from agent.recording.reading import RecordedStep, RecordingReader
+from agent.recording.records import FileFault
 
 UNRECORDED = "the results between them are in no recording, as where a disk was full"
 OTHER = "another engine made it, or it cannot be replayed here"
 LONGEST_REASON = 1000  # characters; a hostile configuration has a hundred thousand faults
 
 
-class Engine(Protocol):
+class ReplayEngine(Protocol):
     """Computes results from the events of a recording. Every method may raise any exception for a damaged recording."""
 
     name: str
 
-    def begin(self, step: Step) -> list[Output]:
+    def begin(self, step: RecordedStep) -> list[Output]:
         """Take the RunStart of a file: make the pipeline from the configuration and the snapshot in it."""
         ...
 
-    def step(self, step: Step) -> list[Output]:
+    def step(self, step: RecordedStep) -> list[Output]:
         """Take the next event, and give its results as a recording holds them."""
         ...
 
@@ -72,7 +72,7 @@ class EngineHere:
         self._restore = restore
         self._pipeline: PipelineLike
 
-    def begin(self, step: Step) -> list[Output]:
+    def begin(self, step: RecordedStep) -> list[Output]:
         start = cast(RunStart, step.event)
         try:
             self._pipeline = self._restore(start.config_json, start.snapshot)
@@ -82,7 +82,7 @@ class EngineHere:
             ) from error
         return self.step(step)
 
-    def step(self, step: Step) -> list[Output]:
+    def step(self, step: RecordedStep) -> list[Output]:
         return [_as_recorded(step.event_sequence, item) for item in recorded_ones(self._pipeline.step(step.event))]
 
     def snapshot(self) -> bytes:
@@ -100,7 +100,7 @@ class Candidate:
     made the file is not here.
     """
 
-    open: Callable[[], AbstractContextManager[Engine]]
+    open: Callable[[], AbstractContextManager[ReplayEngine]]
     own: bool
     missing: str = ""
 
@@ -125,7 +125,7 @@ class ReplayedFile(msgspec.Struct, kw_only=True):
     in_chain: bool = False  # continues the previous file, whose state at its end equals this file's snapshot
     events: int = 0
     results: int = 0  # computed
-    fault: Fault | None = None
+    fault: FileFault | None = None
     undecoded: bool = False  # the fault is a message that this program cannot decode
     good_bytes: int = 0
     refused: str = ""  # why the file cannot be replayed
@@ -214,7 +214,7 @@ class Replayer:
         for candidate in self.choose(start):
             try:
                 with candidate.open() as engine:
-                    replayed = _One(path, engine, candidate.own, self).run()
+                    replayed = _FileReplay(path, engine, candidate.own, self).run()
             except EngineError as error:
                 missing = str(error)
                 continue
@@ -224,10 +224,10 @@ class Replayer:
         return replayed
 
 
-class _One:
+class _FileReplay:
     """The replay of one file by one engine."""
 
-    def __init__(self, path: Path, engine: Engine, own: bool, how: Replayer) -> None:
+    def __init__(self, path: Path, engine: ReplayEngine, own: bool, how: Replayer) -> None:
         self._path, self._engine, self._how = path, engine, how
         self._file = ReplayedFile(path=str(path), replayed_by=engine.name)
         self._file.departure = None if own else Departure()
@@ -268,7 +268,7 @@ class _One:
             file.tolerance = self._how.elsewhere
             file.notes.append(f"recorded with another {', '.join(other)} than on this machine: last bits may differ")
 
-    def _step(self, step: Step) -> None:
+    def _step(self, step: RecordedStep) -> None:
         file, begins = self._file, isinstance(step.event, RunStart)
         try:
             before = [] if step.complete or begins else self._digests()
@@ -315,7 +315,7 @@ def link(replayed: Sequence[Replayed]) -> tuple[list[tuple[int, str]], list[str]
     run is also counted in the replay of the file.
     """
     faults, unproven = list[tuple[int, str]](), list[str]()
-    known = _Left(from_first=bool(replayed) and replayed[0].file.file_sequence == 1)
+    known = _LeftState(from_first=bool(replayed) and replayed[0].file.file_sequence == 1)
     for index, (before, after) in enumerate(pairwise(replayed), start=1):
         start, file = after.start, after.file
         if start is None or before.start is None:
@@ -339,7 +339,7 @@ def link(replayed: Sequence[Replayed]) -> tuple[list[tuple[int, str]], list[str]
     return faults, unproven
 
 
-class _Left:
+class _LeftState:
     """The states that recordings leave for the next run, as far as the replays tell.
 
     `from_first`: the first recording is number 1, so there are no states of earlier ones.

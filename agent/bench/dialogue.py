@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from agent.bench.capture import Capture
-from agent.bench.measuring import Taken
-from agent.bench.screen import Screen, count, pair, told_u
-from agent.bench.session import Fit, Outlook, Session
-from agent.bench.stops import Stop
+from agent.bench.measuring import StopInterval
+from agent.bench.screen import BenchScreen, count, pair, told_u
+from agent.bench.session import BenchSession, Outlook, StopFit
+from agent.bench.stops import BenchStop
 from agent.bench.thinking import Thinking
 from calib.model import Array
 
@@ -25,7 +25,7 @@ STALE_S = 3.0  # without samples of a device for so long the session says so
 
 
 @dataclass(frozen=True, slots=True)
-class Stay:
+class StopStay:
     """How long to stay at a stop, s."""
 
     least_s: float = 5.0
@@ -43,18 +43,18 @@ class Dialogue:
         self,
         mind: Thinking,
         capture: Capture,
-        stay: Stay,
-        screen: Screen,
-        turn: Callable[[Stop], float] | None = None,
+        stay: StopStay,
+        screen: BenchScreen,
+        turn: Callable[[BenchStop], float] | None = None,
     ) -> None:
         self._mind, self._capture = mind, capture
         self._stay, self._screen, self._say, self._turn = stay, screen, screen.say, turn
-        self.taken: list[Taken] = []
+        self.taken: list[StopInterval] = []
         self._refused: tuple[str, ...] = ()
-        self._standing: Stop | None = None  # where the sensor was put last
+        self._standing: BenchStop | None = None  # where the sensor was put last
 
     @property
-    def _session(self) -> Session:
+    def _session(self) -> BenchSession:
         return self._mind.session
 
     def run(self) -> None:
@@ -88,7 +88,7 @@ class Dialogue:
             lines.append("one inclination does not tell theta from the sensitivities: add a second one with --thetas")
         return lines
 
-    def _next_stop(self) -> Stop | None:
+    def _next_stop(self) -> BenchStop | None:
         """The stop that the person takes; None to end the session."""
         best, outlook = self._mind.next_stop()
         stop = self._session.stops[best.stop]
@@ -116,7 +116,7 @@ class Dialogue:
                 return chosen
             self._say(f"  {answer!r} is no position; type it as {stop.name!r}")
 
-    def _put(self, stop: Stop) -> None:
+    def _put(self, stop: BenchStop) -> None:
         """Turn the virtual sensor, unless it stands there already."""
         assert self._turn is not None
         if self._standing is None or self._standing.name != stop.name:
@@ -132,7 +132,7 @@ class Dialogue:
         self._adjust()
         self._screen.kept(self._names, self._session.joint.expanded)
 
-    def _take(self, stop: Stop) -> None:
+    def _take(self, stop: BenchStop) -> None:
         """Stay at a stop, and use it if it is sound."""
         while True:
             start_s = self._capture.now_s + SETTLED_S
@@ -156,7 +156,7 @@ class Dialogue:
                 return
             if self._turn is not None:
                 self._put(stop)
-        self.taken.append(Taken(stop, start_s, stop_s))
+        self.taken.append(StopInterval(stop, start_s, stop_s))
         self._adjust()
         self._screen.took(self._names, self._session.joint.expanded)
         for line in self._session.doubts():
@@ -180,7 +180,7 @@ class Dialogue:
         k = self._earlier(start_s)
         self.taken[k] = replace(self.taken[k], stop=self._session.stops[instead])
 
-    def _misfit(self, stop: Stop, fit: Fit) -> str:
+    def _misfit(self, stop: BenchStop, fit: StopFit) -> str:
         wrong = f"this does not look like {stop.name} (chi2 {fit.chi2:.4g}, {fit.limit:.4g} at most)"
         if fit.earlier is not None:
             start_s, instead = fit.earlier
@@ -200,7 +200,7 @@ class Dialogue:
             f"  Enter: measure again after turning it; y: it is at {like.name}; k: keep it as told; q: leave it out > "
         )
 
-    def _watch(self, stop: Stop, start_s: float) -> tuple[Fit | None, float]:
+    def _watch(self, stop: BenchStop, start_s: float) -> tuple[StopFit | None, float]:
         """How a stay fits its stop, None where it cannot be used; and when it ended. Says at once what is wrong."""
         reason, knocked = "", 0
         told_from_s = REST_TOLD_FROM_S if self._session.expected.rms_mps2 == 0.0 else FIT_FROM_S
@@ -216,7 +216,7 @@ class Dialogue:
             if stayed_s < FIT_FROM_S:
                 self._show_stay(stop, max(stayed_s, 0.0), None)
                 continue
-            look = self._mind.look(self._capture.record(start_s - BEFORE_S), Taken(stop, start_s, now_s))
+            look = self._mind.look(self._capture.record(start_s - BEFORE_S), StopInterval(stop, start_s, now_s))
             if look.reason:
                 if stayed_s >= told_from_s and look.reason.translate(NO_DIGITS) != reason:
                     self._screen.warn(look.reason)
@@ -236,5 +236,5 @@ class Dialogue:
             if enough or not look.fit.fits or stayed_s > self._stay.most_s:
                 return look.fit, now_s
 
-    def _show_stay(self, stop: Stop, stayed_s: float, u: Array | None) -> None:
+    def _show_stay(self, stop: BenchStop, stayed_s: float, u: Array | None) -> None:
         self._screen.stay(stop, stayed_s, self._stay.least_s, self._stay.most_s, u)

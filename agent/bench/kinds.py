@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from agent.bench.stops import GRAVITY, Stop, on_clamp, on_faces, turned_by_hand
+from agent.bench.stops import GRAVITY, BenchStop, on_clamp, on_faces, turned_by_hand
 from agent.config import Channel
 from agent.config.knowledge import PRIORS
 from calib.estimate import quantities
@@ -29,7 +29,7 @@ def kind_of(channel: Channel) -> Kind:
     return "clamp" if channel.rotation is None else "triad"
 
 
-def stops_of(channel: Channel, thetas_deg: Sequence[float], alphas_deg: Sequence[float]) -> list[Stop]:
+def stops_of(channel: Channel, thetas_deg: Sequence[float], alphas_deg: Sequence[float]) -> list[BenchStop]:
     """The positions that can be taken. Raises ValueError where an AC-coupled sensor has none."""
     kind = kind_of(channel)
     if kind == "clamp":
@@ -42,13 +42,13 @@ def stops_of(channel: Channel, thetas_deg: Sequence[float], alphas_deg: Sequence
     return turned_by_hand(np.reshape(channel.rotation, (3, 3)), channel.gravity_mps2)
 
 
-def mounted(channel: Channel) -> Stop:
+def mounted(channel: Channel) -> BenchStop:
     """A mounted sensor beside a tri-axial reference, which feels gravity and so tells how both stand."""
     assert channel.rotation is not None
     up = np.array([0.0, 0.0, channel.gravity_mps2])  # read again, it only shows that gravity is felt
     felt = np.zeros(3) if channel.coupling == "dc" else None
     pose = beside(np.reshape(channel.rotation, (3, 3)), felt)
-    return Stop("", channel.sensor, pose, dict(zip(GRAVITY, up.tolist(), strict=True)), np.zeros(3))
+    return BenchStop("", channel.sensor, pose, dict(zip(GRAVITY, up.tolist(), strict=True)), np.zeros(3))
 
 
 def stated(channel: Channel, directory: Path, unit: str) -> list[str]:

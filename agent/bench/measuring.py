@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.bench.capture import DeviceSamples
-from agent.bench.stops import Stop
+from agent.bench.stops import BenchStop
 from agent.config import Channel
 from calib.adjustment.adjustment import adjust
 from calib.estimate.nuisances import Applied, Priors
@@ -32,10 +32,10 @@ QUANTITY = {"acceleration": ("a",), "velocity": ("v",), "displacement": ("d",)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Taken:
+class StopInterval:
     """A stop from `start_s` to `stop_s`."""
 
-    stop: Stop
+    stop: BenchStop
     start_s: float
     stop_s: float
 
@@ -59,19 +59,19 @@ class Measuring:
         """How long samples are needed before and after a stop, for filters."""
         return most_margin_s(self._channel.instrument)
 
-    def newest(self, record: Record, taken: Taken) -> list[Window]:
+    def newest(self, record: Record, taken: StopInterval) -> list[Window]:
         """The windows of the stop that is being taken, used or not; empty where there are too few samples yet."""
         try:
             return self._tables(record, [taken]).windows(self.lag_s)
         except ValueError:
             return []
 
-    def all(self, record: Record, taken: Sequence[Taken]) -> tuple[list[Window], Priors]:
+    def all(self, record: Record, taken: Sequence[StopInterval]) -> tuple[list[Window], Priors]:
         """The used windows of all stops, with their lag taken out, and the priors for them."""
         windows = _used(self.without_lag(record, taken))
         return windows, over_frequency(self.priors, windows, self.lag_s)
 
-    def without_lag(self, record: Record, taken: Sequence[Taken]) -> list[Window]:
+    def without_lag(self, record: Record, taken: Sequence[StopInterval]) -> list[Window]:
         """The windows of all stops, used or not, with their lag taken out."""
         applied = Applied.of(self.priors, 0.0)
 
@@ -82,11 +82,11 @@ class Measuring:
         windows, self.lag_s = without_lag(self.lag_s, self._tables(record, taken).windows, _used, lag_of)
         return windows
 
-    def outcome(self, record: Record, taken: Sequence[Taken]) -> Outcome:
+    def outcome(self, record: Record, taken: Sequence[StopInterval]) -> Outcome:
         """What `fieldcal calibrate` would say of these stops."""
         return adjusted(self._tables(record, taken), self.priors)
 
-    def refused(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
+    def refused(self, record: Record, taken: Sequence[StopInterval]) -> tuple[str, ...]:
         """Why `fieldcal calibrate` would refuse these stops; empty if it would not."""
         return self.outcome(record, taken).reasons
 
@@ -100,7 +100,7 @@ class Measuring:
         assert self._channel.reference is not None
         return np.asarray(record[self._channel.reference].values / self._channel.certificate.sensitivity)
 
-    def _tables(self, record: Record, taken: Sequence[Taken]) -> Tables:
+    def _tables(self, record: Record, taken: Sequence[StopInterval]) -> Tables:
         """Raises ValueError where there are too few samples."""
         own, name = record[self._channel.sensor], self._channel.sensor
         sensor = SensorTable(name, own.time_s, own.values)
@@ -115,7 +115,7 @@ class Measuring:
         limits = Limits.of(self._options.u_offset_mps2, math.radians(self._options.u_angle_deg))
         return Tables(sensor, reference, intervals, instrument, Making(Settings(limits, bands=True)))
 
-    def write(self, record: Record, taken: Sequence[Taken], directory: Path) -> None:
+    def write(self, record: Record, taken: Sequence[StopInterval], directory: Path) -> None:
         """Write sensor.csv, reference.csv and poses.csv for `fieldcal calibrate`. Raises OSError."""
         own = record[self._channel.sensor]
         columns, header = [own.time_s, *own.values.T], "time_s,vx,vy,vz"

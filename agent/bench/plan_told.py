@@ -10,7 +10,7 @@ import numpy as np
 
 from agent.bench.planned import Planned, angles_deg, if_in_radians, more_stops, planned, states_positions
 from agent.bench.session import START
-from agent.bench.stops import GRAVITY, Stop
+from agent.bench.stops import GRAVITY, BenchStop
 from agent.config import Channel, Config
 from agent.config.names import Told
 from agent.setup.contradictions import contradictions, nominal_of
@@ -142,7 +142,7 @@ def _remedy(channel: Channel, nominal: float | None) -> str:
     return "state with gate.least_determined how many are enough, or smaller uncertainties in prior"
 
 
-def _as_stated(stop: Stop) -> str:
+def _as_stated(stop: BenchStop) -> str:
     """A position as the configuration states it, without times."""
     held = stop.columns
     if "theta_deg" in held:

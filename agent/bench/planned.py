@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agent.bench.session import START
-from agent.bench.stops import CORNER, GRAVITY, Stop, on_clamp, on_faces, ways
+from agent.bench.stops import CORNER, GRAVITY, BenchStop, on_clamp, on_faces, ways
 from agent.config import Channel
 from agent.config.pose import Stop as Stated
 from agent.core.anchor import Anchor
@@ -20,7 +20,7 @@ from calib.estimate.determined import determined
 from calib.estimate.nuisances import Priors
 from calib.geometry import along, beside
 from calib.model import PARAMETERS, Array, Calibration
-from calib.visit.next_stop import COVERAGE_FACTOR, Flags, Joint, Plan, Wanted
+from calib.visit.next_stop import COVERAGE_FACTOR, Flags, JointCovariance, Plan, WantedUncertainty
 
 MOST_STOPS = 100  # of more, so many that are spread over them tell nearly the same
 MOST_MORE = 4  # stops that are proposed
@@ -74,16 +74,16 @@ def planned(channel: Channel, nominal: float | None) -> Planned:
     return _told_by(channel, nominal, _stops(channel))
 
 
-def more_stops(channel: Channel, nominal: float | None) -> list[Stop]:
+def more_stops(channel: Channel, nominal: float | None) -> list[BenchStop]:
     """The positions that are missing, the one that gains most first; empty where no position helps."""
     stops, candidates = _stops(channel), _candidates(channel)
-    found: list[Stop] = []
+    found: list[BenchStop] = []
     while candidates and not _told_by(channel, nominal, [*stops, *found]).enough:
         if len(found) == MOST_MORE:
             return []
         priors = _priors(channel, nominal)
         plan, joint = _plan(candidates, priors), _after([*stops, *found], priors)
-        found.append(candidates[plan.suggestions(joint, START, Wanted())[0].stop])
+        found.append(candidates[plan.suggestions(joint, START, WantedUncertainty())[0].stop])
     return found
 
 
@@ -111,23 +111,23 @@ def _stated(channel: Channel) -> Sequence[Stated]:
     return channel.poses or (() if channel.positions == "free" else channel.positions)
 
 
-def _stops(channel: Channel) -> list[Stop]:
+def _stops(channel: Channel) -> list[BenchStop]:
     """The positions that the configuration states, none twice."""
     if channel.rotation is not None:
         stated = channel.rotation_gravity_mps2
         pose = beside(np.reshape(channel.rotation, (3, 3)), stated if channel.coupling == "dc" else np.zeros(3))
         of_gravity = channel.coupling == "dc" and stated is not None and not any(stated)
         up = channel.gravity_mps2 * np.array([0.0, 0.0, 1.0]) if of_gravity else np.zeros(3)
-        return [Stop("", "", pose, {}, np.reshape(channel.rotation, (3, 3)).T @ up)]
+        return [BenchStop("", "", pose, {}, np.reshape(channel.rotation, (3, 3)).T @ up)]
     forms = {(one.theta_deg, one.alpha_deg, one.direction, one.gravity_mps2): one for one in _stated(channel)}
     some = np.unique(np.linspace(0, len(forms) - 1, min(len(forms), MOST_STOPS)).astype(int))
     chosen = [list(forms.values())[k] for k in some]
     felt = channel.coupling == "dc"
     poses = [one.pose(channel.gravity_mps2, channel.static_sign, feels_gravity=felt) for one in chosen]
-    return [Stop("", "", pose, {}, np.zeros(pose.direction.shape[1])) for pose in poses]
+    return [BenchStop("", "", pose, {}, np.zeros(pose.direction.shape[1])) for pose in poses]
 
 
-def _candidates(channel: Channel) -> list[Stop]:
+def _candidates(channel: Channel) -> list[BenchStop]:
     """The positions that may be taken besides: of the clamp, along axes, edges and corners, or on the six faces."""
     if channel.rotation is not None:
         return []
@@ -141,13 +141,13 @@ def _candidates(channel: Channel) -> list[Stop]:
     found = []
     for told, name, up in ways(CORNER):
         columns = dict(zip(("dx", "dy", "dz", *GRAVITY), [*up, *(felt * up)], strict=True))
-        found.append(Stop(told, name, along(up, felt * up), columns, np.zeros(1)))
+        found.append(BenchStop(told, name, along(up, felt * up), columns, np.zeros(1)))
     return found
 
 
-def _told_by(channel: Channel, nominal: float | None, stops: Sequence[Stop]) -> Planned:
+def _told_by(channel: Channel, nominal: float | None, stops: Sequence[BenchStop]) -> Planned:
     priors = _priors(channel, nominal)
-    before, once = Joint.before(priors, _scale(priors)), _after(stops, priors)
+    before, once = JointCovariance.before(priors, _scale(priors)), _after(stops, priors)
     often = _after(stops, priors.with_values({"offset_mps2": priors.offset_mps2 / np.sqrt(OFTEN)}))
     gate = channel.gate.filled(before.scale, fixed_mount=channel.fixed_mount)
     told = determined(before.mean, _u(often), _u(before), np.ones(12, dtype=bool))
@@ -171,9 +171,9 @@ def _scale(priors: Priors) -> float:
     return priors.output_per_mps2 or 1.0
 
 
-def _after(stops: Sequence[Stop], priors: Priors) -> Joint:
+def _after(stops: Sequence[BenchStop], priors: Priors) -> JointCovariance:
     """What is known once each position was taken."""
-    joint = Joint.before(priors, _scale(priors))
+    joint = JointCovariance.before(priors, _scale(priors))
     blind = [bool(np.isnan(stop.pose.gravity_mps2).any()) for stop in stops]
     for unknown in (False, True):
         some = [stop for stop, is_blind in zip(stops, blind, strict=True) if is_blind == unknown]
@@ -185,12 +185,12 @@ def _after(stops: Sequence[Stop], priors: Priors) -> Joint:
     return joint
 
 
-def _plan(stops: Sequence[Stop], priors: Priors) -> Plan:
+def _plan(stops: Sequence[BenchStop], priors: Priors) -> Plan:
     poses = [replace(stop.pose, gravity_mps2=np.nan_to_num(stop.pose.gravity_mps2)) for stop in stops]
     return Plan(poses, priors, np.array([stop.reference_mps2 for stop in stops]))
 
 
-def _unseen(stops: Sequence[Stop]) -> Array | None:
+def _unseen(stops: Sequence[BenchStop]) -> Array | None:
     """The direction along which neither motion nor gravity is felt to change."""
     gravity = np.nan_to_num(np.array([stop.pose.gravity_mps2 for stop in stops]))
     felt = [*(gravity - gravity.mean(axis=0)), *(START.rms_mps2 * d for s in stops for d in s.pose.direction.T)]
@@ -200,5 +200,5 @@ def _unseen(stops: Sequence[Stop]) -> Array | None:
     return np.asarray(axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0]))
 
 
-def _u(joint: Joint) -> Array:
+def _u(joint: JointCovariance) -> Array:
     return np.asarray(np.sqrt(np.diag(joint.covariance)[:12]))

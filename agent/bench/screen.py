@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from agent.bench.session import Outlook, Session
-from agent.bench.stops import AXES, Stop
+from agent.bench.session import BenchSession, Outlook
+from agent.bench.stops import AXES, BenchStop
 from agent.delivery.guide import (
     LINES_MAX,
     STOPS_MAX,
@@ -29,18 +29,18 @@ from agent.delivery.guide import (
 )
 from calib.model import Array
 from calib.rounding import plus_minus
-from calib.visit.next_stop import MAIN, POWER, Suggestion, Wanted
+from calib.visit.next_stop import MAIN, POWER, Suggestion, WantedUncertainty
 
 NAME_MAX = 63
 
 
-class Screen:
+class BenchScreen:
     """Says each thing to both. `publish` takes the guide, `ask`, `say` and `progress` are of the terminal."""
 
     def __init__(
         self,
         sensor: str,
-        wanted: Wanted,
+        wanted: WantedUncertainty,
         ask: Callable[[str], str | None],
         say: Callable[[str], None],
         progress: Callable[[str], None],
@@ -76,7 +76,7 @@ class Screen:
             self.say(line)
         self._show(outlook=[clipped(line) for line in lines][:LINES_MAX])
 
-    def turn(self, number: int, stop: Stop, best: Suggestion, session: Session, ahead: Outlook) -> None:
+    def turn(self, number: int, stop: BenchStop, best: Suggestion, session: BenchSession, ahead: Outlook) -> None:
         """Say which position comes next, why, and what U will be after it."""
         before, more = session.joint.expanded, None if ahead.stops is None else max(ahead.stops - 1, 0)
         why = _gained(before, best.expanded, session.wanted)
@@ -89,7 +89,7 @@ class Screen:
         coming = NextStop(number, clipped(stop.name, NAME_MAX), clipped(stop.told), clipped(why), after, more)
         self._show(stage="turn", next=coming, staying=None, expanded=_expanded(before))
 
-    def stay(self, stop: Stop, stayed_s: float, least_s: float, most_s: float, u: Array | None) -> None:
+    def stay(self, stop: BenchStop, stayed_s: float, least_s: float, most_s: float, u: Array | None) -> None:
         """Show how the present position goes on. `u` (9,): U with it, None as long as it is not known."""
         if u is not None:
             self._progress(f"  {stayed_s:3.0f} s: U will be {told_u(u)}")
@@ -117,7 +117,7 @@ class Screen:
         self._show(stage="ended", next=None, staying=None, prompt="", ending=_ending(output, status))
 
 
-def _gained(before: Array, after: Array, wanted: Wanted) -> str:
+def _gained(before: Array, after: Array, wanted: WantedUncertainty) -> str:
     """The element of S of which a stop tells most, by what the plan compares stops with, and its U."""
     cost = (before / wanted.by_parameter) ** POWER - (after / wanted.by_parameter) ** POWER
     k = int(np.argmax(cost))

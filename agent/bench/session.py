@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agent.bench.stops import Stop, angles_of, like
+from agent.bench.stops import BenchStop, angles_of, like
 from calib.adjustment.adjustment import Adjustment, adjust
 from calib.distributions import chi2_quantile
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import S_AND_Q
 from calib.model import Window
-from calib.visit.next_stop import Expected, Joint, Plan, Suggestion, Told, Wanted
+from calib.visit.next_stop import Expected, JointCovariance, Plan, StopIndications, Suggestion, WantedUncertainty
 from calib.visit.stop_order import stops_ahead
 from calib.windows.sums import factor
 
@@ -34,7 +34,7 @@ START = Expected(5.0, 0.02, 1e5)
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class StopFit:
     """Whether a window fits the stop that was told: chi2, its limit, and the stop that fits instead, if any does.
 
     `earlier`: an earlier window, without which this one fits, while the earlier one then fits another stop only: when
@@ -65,14 +65,14 @@ class Outlook:
     because: str
 
 
-class Session:
+class BenchSession:
     """`take` changes it; everything else reads."""
 
     def __init__(
         self,
-        stops: Sequence[Stop],
+        stops: Sequence[BenchStop],
         priors: Priors,
-        wanted: Wanted,
+        wanted: WantedUncertainty,
         scale: float = 1.0,
         expected: Expected = START,
     ) -> None:
@@ -82,7 +82,7 @@ class Session:
         self.priors = priors
         self.plan = _plan(stops, priors)
         self._scale, self._priors_now = scale, priors
-        self.joint = Joint.before(priors, scale)
+        self.joint = JointCovariance.before(priors, scale)
         self.expected = expected if stops[0].pose.direction.shape[1] == 1 else replace(expected, rms_mps2=0.0)
         self.windows: list[Window] = []
         self.found: Adjustment | None = None
@@ -92,11 +92,11 @@ class Session:
         """Whether all uncertainties are as wanted."""
         return self.wanted.reached(self.joint.expanded)
 
-    def index_of(self, stop: Stop) -> int:
+    def index_of(self, stop: BenchStop) -> int:
         """The number of a stop among `stops`."""
         return next(k for k, each in enumerate(self.stops) if each.name == stop.name)
 
-    def named(self, text: str) -> Stop | None:
+    def named(self, text: str) -> BenchStop | None:
         """The stop that a person typed; a position of the clamp that was not among `stops` is from now on.
 
         None where the text is no position.
@@ -139,29 +139,29 @@ class Session:
             if (freedom := 3 * count - len(S_AND_Q)) <= 0:
                 continue  # the scatter is not seen yet, and the next rest may show a large one
             seen = np.sqrt(chi2_quantile(MOST_SESSIONS, freedom) / freedom)
-            wanted = Wanted(self.wanted.main / seen, self.wanted.transverse / seen)
+            wanted = WantedUncertainty(self.wanted.main / seen, self.wanted.transverse / seen)
             if len(stops_ahead(self.plan, self.joint, self.expected, wanted, MOST_AHEAD)) <= count:
                 return count
         return stops
 
-    def fit(self, stop: int, window: Window) -> Fit:
+    def fit(self, stop: int, window: Window) -> StopFit:
         """Whether a window fits this stop, by all that is known before it."""
         found = self._fit(self.joint, stop, window)
         return found if found.fits else replace(found, earlier=self._earlier(stop, window))
 
-    def _fit(self, known: Joint, stop: int, window: Window) -> Fit:
-        chi2 = self.plan.surprise(known, Told.of(window), expected_of(window, known.scale))
+    def _fit(self, known: JointCovariance, stop: int, window: Window) -> StopFit:
+        chi2 = self.plan.surprise(known, StopIndications.of(window), expected_of(window, known.scale))
         limit = STATED_TIMES**2 * chi2_quantile(1.0 - FALSE_ALARM, 3.0 if window.kind == "rest" else 6.0)
         best = int(np.argmin(chi2))
         fits = bool(chi2[stop] <= min(limit, chi2[best] + DECISIVE_CHI2))
-        return Fit(fits, float(chi2[stop]), limit, None if fits or chi2[best] > limit else best)
+        return StopFit(fits, float(chi2[stop]), limit, None if fits or chi2[best] > limit else best)
 
     def _earlier(self, stop: int, window: Window) -> tuple[float, int] | None:
         """The earlier window that is wrong rather than this one, by leaving out each in turn."""
         suspects = []
         for k, each in enumerate(self.windows if len(self.windows) >= FEWEST_WITNESSES else ()):
             own = next((n for n, s in enumerate(self.stops) if s.pose.position == each.pose.position), None)
-            known = Joint.after(adjust([*self.windows[:k], *self.windows[k + 1 :]], self._priors_now))
+            known = JointCovariance.after(adjust([*self.windows[:k], *self.windows[k + 1 :]], self._priors_now))
             if own is None or not self._fit(known, stop, window).fits:
                 continue
             found = self._fit(known, own, each)
@@ -171,7 +171,7 @@ class Session:
 
     def restart(self) -> None:
         """Forget all stops."""
-        self.windows, self.found, self.joint = [], None, Joint.before(self.priors, self._scale)
+        self.windows, self.found, self.joint = [], None, JointCovariance.before(self.priors, self._scale)
 
     def doubts(self) -> list[str]:
         """Stated values that the stops contradict, one line each, for a person."""
@@ -195,11 +195,11 @@ class Session:
         self.windows = list(windows)
         self._priors_now = priors or self.priors
         self.found = adjust(self.windows, self._priors_now)
-        self.joint = Joint.after(self.found)
+        self.joint = JointCovariance.after(self.found)
         self.expected = expected_of(self.windows[-1], self.joint.scale)
 
 
-def _plan(stops: Sequence[Stop], priors: Priors) -> Plan:
+def _plan(stops: Sequence[BenchStop], priors: Priors) -> Plan:
     return Plan([s.pose for s in stops], priors, np.array([s.reference_mps2 for s in stops]))
 
 

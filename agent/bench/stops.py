@@ -17,7 +17,7 @@ FACE, CORNER = 1, 3  # how many axes point up equally, at most
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stop:
+class BenchStop:
     """One position: `told` to people, `name` as a person types it, its pose, and its columns in poses.csv.
 
     `reference_mps2` (m,): the mean that the reference shows there.
@@ -32,10 +32,10 @@ class Stop:
 
 def on_clamp(
     thetas_deg: Sequence[float], alphas_deg: Sequence[float], gravity_mps2: float, static_sign: int
-) -> list[Stop]:
+) -> list[BenchStop]:
     """The positions of a clamp with these inclinations and rotations. `gravity_mps2` is 0 for an AC-coupled sensor."""
     return [
-        Stop(
+        BenchStop(
             f"incline the clamp to theta = {theta:g} deg and turn the sensor on it to alpha = {alpha:g} deg",
             f"{theta:g} {alpha:g}",
             clamp(float(np.deg2rad(theta)), float(np.deg2rad(alpha)), gravity_mps2, static_sign),
@@ -55,7 +55,7 @@ def angles_of(text: str) -> tuple[float, float] | None:
     return (theta_deg, alpha_deg) if abs(theta_deg) <= 90.0 and abs(alpha_deg) <= 360.0 else None
 
 
-def like(stop: Stop, theta_deg: float, alpha_deg: float) -> Stop:
+def like(stop: BenchStop, theta_deg: float, alpha_deg: float) -> BenchStop:
     """Another position of the clamp on which `stop` is one."""
     gravity_mps2 = float(np.linalg.norm(stop.pose.gravity_mps2))
     upright = clamp(stop.pose.theta_rad or 0.0, stop.pose.alpha_rad or 0.0, 1.0).gravity_mps2
@@ -63,14 +63,14 @@ def like(stop: Stop, theta_deg: float, alpha_deg: float) -> Stop:
     return on_clamp([theta_deg], [alpha_deg % 360.0], gravity_mps2, sign)[0]
 
 
-def turned_by_hand(rotation: Array, gravity_mps2: float) -> list[Stop]:
+def turned_by_hand(rotation: Array, gravity_mps2: float) -> list[BenchStop]:
     """Rests of a sensor that is fixed to a calibrated triad: axes, edges and corners up. The triad tells how it stands.
 
     `rotation` (3, 3) is R in a = R a_ref.
     """
     pose = beside(rotation)
     return [
-        Stop(
+        BenchStop(
             f"turn sensor and reference together, until {told} up, and put them down",
             name,
             Pose(pose.position, pose.direction, np.zeros(3)),
@@ -81,14 +81,14 @@ def turned_by_hand(rotation: Array, gravity_mps2: float) -> list[Stop]:
     ]
 
 
-def on_faces(gravity_mps2: float) -> list[Stop]:
+def on_faces(gravity_mps2: float) -> list[BenchStop]:
     """Rests on the six faces of the sensor's housing, on a level table."""
     found = []
     for told, name, up in ways(FACE):
         felt = gravity_mps2 * up
         columns = dict(zip(GRAVITY, felt.tolist(), strict=True))
         found.append(
-            Stop(f"put the sensor on a level table, {told} up", name, at_rest(felt, name), columns, np.zeros(0))
+            BenchStop(f"put the sensor on a level table, {told} up", name, at_rest(felt, name), columns, np.zeros(0))
         )
     return found
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from agent.bench.aside import Aside
-from agent.bench.measuring import Measuring, Record, Taken
-from agent.bench.session import Fit, Outlook, Session, expected_of
+from agent.bench.measuring import Measuring, Record, StopInterval
+from agent.bench.session import BenchSession, Outlook, StopFit, expected_of
 from calib.model import Array, Window
 from calib.visit.next_stop import Suggestion
 
@@ -29,35 +29,35 @@ class Look:
     left_out: int = 0
     expanded: Array | None = None
     gain: float = np.inf
-    fit: Fit | None = None
+    fit: StopFit | None = None
 
 
 class Thinking:
     """A session and its measuring. Each method computes aside, in the other process."""
 
-    def __init__(self, session: Session, measuring: Measuring, aside: Aside) -> None:
+    def __init__(self, session: BenchSession, measuring: Measuring, aside: Aside) -> None:
         self.session, self.measuring, self._aside = session, measuring, aside
 
     def next_stop(self) -> tuple[Suggestion, Outlook]:
         """The stop that gains most, and how far it is to what is wanted."""
         return self._aside.call(_next_stop, self.session)
 
-    def look(self, record: Record, taken: Taken) -> Look:
+    def look(self, record: Record, taken: StopInterval) -> Look:
         """Look at the stop that is being taken."""
         return self._aside.call(_look, self.session, self.measuring, record, taken)
 
-    def take(self, record: Record, taken: Sequence[Taken]) -> tuple[str, ...]:
+    def take(self, record: Record, taken: Sequence[StopInterval]) -> tuple[str, ...]:
         """Adjust all stops; none at all begins anew. Where all is as wanted: why the result would be refused."""
         found = self._aside.call(_take, self.session, self.measuring, record, taken)
         self.session, self.measuring, refused = found
         return refused
 
 
-def _next_stop(session: Session) -> tuple[Suggestion, Outlook]:
+def _next_stop(session: BenchSession) -> tuple[Suggestion, Outlook]:
     return session.suggestion(), session.outlook()
 
 
-def _look(session: Session, measuring: Measuring, record: Record, taken: Taken) -> Look:
+def _look(session: BenchSession, measuring: Measuring, record: Record, taken: StopInterval) -> Look:
     made = measuring.newest(record, taken)
     used = [w for w in made if w.used]
     if not used:
@@ -71,8 +71,8 @@ def _look(session: Session, measuring: Measuring, record: Record, taken: Taken) 
 
 
 def _take(
-    session: Session, measuring: Measuring, record: Record, taken: Sequence[Taken]
-) -> tuple[Session, Measuring, tuple[str, ...]]:
+    session: BenchSession, measuring: Measuring, record: Record, taken: Sequence[StopInterval]
+) -> tuple[BenchSession, Measuring, tuple[str, ...]]:
     if not taken:
         session.restart()
         return session, measuring, ()

@@ -12,9 +12,9 @@ import numpy as np
 from agent.bench.capture import Capture
 from agent.bench.clamp_words import as_object, findings
 from agent.bench.dialogue import BEFORE_S, GAIN, SETTLED_S, STALE_S
-from agent.bench.measuring import Taken
+from agent.bench.measuring import StopInterval
 from agent.bench.screen import told_u
-from agent.bench.stops import Stop
+from agent.bench.stops import BenchStop
 from agent.bench.visiting import Ahead, Visiting, VisitLook
 from calib.visit.clamping import Clamping
 
@@ -25,7 +25,7 @@ Ending = Literal["measured", "left out", "quit"]
 
 
 @dataclass(frozen=True, slots=True)
-class Stay:
+class VisitStay:
     """How long to stay beside a sensor at least and at most, s."""
 
     least_s: float
@@ -40,7 +40,7 @@ class Visited:
     """
 
     ending: Ending
-    taken: Taken | None = None
+    taken: StopInterval | None = None
     look: VisitLook | None = None
     reached: bool = False
     promised_s: float | None = None
@@ -63,7 +63,7 @@ class VisitDialogue:
         self,
         visiting: Visiting,
         capture: Capture,
-        stay: Stay,
+        stay: VisitStay,
         ask: Callable[[str], str | None],
         say: Callable[[str], None],
         progress: Callable[[str], None],
@@ -74,7 +74,7 @@ class VisitDialogue:
         self._promised_s: float | None = None
         self._warned: set[str] = set()
 
-    def run(self, stop: Stop) -> Visited:
+    def run(self, stop: BenchStop) -> Visited:
         """One visit at a sensor."""
         prompt = "  Enter when it is clamped and nobody touches it; s: leave this sensor out; q: end > "
         kept, visited = False, Visited("left out")
@@ -94,7 +94,7 @@ class VisitDialogue:
                 return visited
             prompt = "  Enter: measure anew; k: measure with the clamp as it is; s: leave this sensor out; q: end > "
 
-    def _watch(self, stop: Stop, kept: bool) -> tuple[Visited, bool]:
+    def _watch(self, stop: BenchStop, kept: bool) -> tuple[Visited, bool]:
         """How a stay ended, and whether the clamp is wrong so that the person must decide."""
         start_s = self._capture.now_s + SETTLED_S
         self._promised_s, wait_s = None, LOOK_S
@@ -110,7 +110,7 @@ class VisitDialogue:
             if now_s - start_s < CLAMP_FROM_S:
                 self._progress(f"  {now_s - start_s:3.0f} s: looking at the clamp")
                 continue
-            taken = Taken(stop, start_s, now_s)
+            taken = StopInterval(stop, start_s, now_s)
             look = self._visiting.look(self._capture.record(start_s - BEFORE_S), taken)
             wait_s = max(LOOK_S, 2.0 * (self._capture.now_s - now_s))
             found = {} if look.clamp is None else findings(look.clamp, stop.name)
@@ -128,7 +128,7 @@ class VisitDialogue:
                 self._warned.add(kind)
         return bool({"loose", "turned"} & set(found))
 
-    def _goes_on(self, taken: Taken, look: VisitLook, found: dict[str, str]) -> Visited | None:
+    def _goes_on(self, taken: StopInterval, look: VisitLook, found: dict[str, str]) -> Visited | None:
         """How the visit ends; None to stay."""
         stayed_s, later = taken.stop_s - taken.start_s, look.ahead
         over = stayed_s >= self._stay.most_s

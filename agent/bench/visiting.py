@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from agent.bench.aside import Aside
-from agent.bench.measuring import Measuring, Record, Taken
+from agent.bench.measuring import Measuring, Record, StopInterval
 from calib.estimate.quantities import LAG, S_AND_Q
 from calib.model import Array, Window
 from calib.recorded.outcome import Outcome
 from calib.visit.clamping import Clamping, clamping
-from calib.visit.next_stop import COVERAGE_FACTOR, MAIN, Wanted
+from calib.visit.next_stop import COVERAGE_FACTOR, MAIN, WantedUncertainty
 
 # Sources of the budget that shrink as more is measured: their variance goes with the inverse of the time. All others
 # stay, such as the reference, its rotation, and what was known before of the transverse sensitivities.
@@ -47,7 +47,7 @@ class VisitLook:
     reasons: tuple[str, ...]
 
 
-def ahead(outcome: Outcome, measured_s: float, wanted: Wanted) -> Ahead | None:
+def ahead(outcome: Outcome, measured_s: float, wanted: WantedUncertainty) -> Ahead | None:
     """What an outcome tells of a longer visit; None where it was refused."""
     if outcome.calibration is None:
         return None
@@ -80,7 +80,7 @@ def ahead(outcome: Outcome, measured_s: float, wanted: Wanted) -> Ahead | None:
     return Ahead(now, at_last, measured_s / float(ratio.min()), because)
 
 
-def looked(measuring: Measuring, wanted: Wanted, record: Record, taken: Taken) -> VisitLook:
+def looked(measuring: Measuring, wanted: WantedUncertainty, record: Record, taken: StopInterval) -> VisitLook:
     """A look at the samples of a visit so far."""
     windows = measuring.newest(record, taken)
     if not any(w.used for w in windows):
@@ -108,9 +108,9 @@ class Visiting:
     """The measuring of one visit, which computes aside."""
 
     measuring: Measuring
-    wanted: Wanted
+    wanted: WantedUncertainty
     aside: Aside
 
-    def look(self, record: Record, taken: Taken) -> VisitLook:
+    def look(self, record: Record, taken: StopInterval) -> VisitLook:
         """A look at the samples so far."""
         return self.aside.call(looked, self.measuring, self.wanted, record, taken)

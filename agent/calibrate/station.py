@@ -16,7 +16,7 @@ from agent import __version__
 from agent.config.files import read_file
 from agent.config.xml import check_xml
 from agent.reading.source import TableError
-from agent.reading.stationxml import LARGEST, Component, import_obspy
+from agent.reading.stationxml import LARGEST, StationChannel, import_obspy
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import Array
 from calib.recorded.options import Options
@@ -26,14 +26,14 @@ from calib.recorded.poses import DIRECTION, GRAVITY
 IN_DIRECTION = 1e-3  # of a unit vector: what an axis that nobody moved may contribute
 
 
-def coupling_of(components: Sequence[Component]) -> Literal["dc", "ac"] | None:
+def coupling_of(components: Sequence[StationChannel]) -> Literal["dc", "ac"] | None:
     """The coupling of an instrument by its metadata, None without any."""
     if not components:
         return None
     return "dc" if all(c.feels_gravity for c in components) else "ac"
 
 
-def frame_of(components: Sequence[Component]) -> Array:
+def frame_of(components: Sequence[StationChannel]) -> Array:
     """The axes (3, 3) of a sensor in east, north, up, row by row: a_sensor = F a_enu.
 
     They are those of its outputs by the metadata, made rectangular (polar decomposition) and right-handed: where the
@@ -48,7 +48,7 @@ def frame_of(components: Sequence[Component]) -> Array:
     return np.asarray(frame * np.array([[1.0], [1.0], [np.sign(np.linalg.det(frame))]]))
 
 
-def by_metadata(options: Options, sensor: Sequence[Component], reference: Sequence[Component]) -> Options:
+def by_metadata(options: Options, sensor: Sequence[StationChannel], reference: Sequence[StationChannel]) -> Options:
     """The options with the couplings and the rotation as the metadata of both instruments say."""
     rotation = options.rotation
     if rotation is None and sensor and len(reference) == 3:
@@ -59,7 +59,7 @@ def by_metadata(options: Options, sensor: Sequence[Component], reference: Sequen
 
 
 def pose_of_station(
-    sensor: Sequence[Component], reference: Sequence[Component], options: Options
+    sensor: Sequence[StationChannel], reference: Sequence[StationChannel], options: Options
 ) -> Mapping[str, float]:
     """The fields of the pose of a sensor beside a reference with three axes or one, from the metadata of both."""
     frame = frame_of(sensor)
@@ -70,7 +70,7 @@ def pose_of_station(
     return dict(zip(DIRECTION, (frame @ reference[0].direction).tolist(), strict=True)) | felt
 
 
-def compared(outcome: Outcome, components: Sequence[Component]) -> list[dict[str, Any]]:
+def compared(outcome: Outcome, components: Sequence[StationChannel]) -> list[dict[str, Any]]:
     """For each output: sensitivity, azimuth and dip as stated and as found with U, and which of them differ.
 
     Found values are None where the data do not tell them: orientation without motion in three directions, the azimuth
@@ -81,12 +81,12 @@ def compared(outcome: Outcome, components: Sequence[Component]) -> list[dict[str
     ]  # fmt: skip
 
 
-def _first_of_each(components: Sequence[Component]) -> list[int]:
+def _first_of_each(components: Sequence[StationChannel]) -> list[int]:
     ids = [c.seed_id for c in components]
     return [ids.index(each) for each in dict.fromkeys(ids)]
 
 
-def _compared(outcome: Outcome, component: Component, k: int, frame: Array) -> dict[str, Any]:
+def _compared(outcome: Outcome, component: StationChannel, k: int, frame: Array) -> dict[str, Any]:
     calibration = outcome.calibration
     assert calibration is not None
     components = slice(3 * k, 3 * k + 3)

@@ -15,9 +15,9 @@ from agent.reading.gravity import told_in_g
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
-from agent.reading.stationxml import Component
+from agent.reading.stationxml import StationChannel
 from calib.output_unit import common
-from calib.recorded.choice import Choice, Chosen
+from calib.recorded.choice import Choice, ChosenColumn
 from calib.recorded.columns import reference_columns, sensor_columns, si_of
 from calib.recorded.table import (
     ReferenceTable,
@@ -35,7 +35,7 @@ class SensorFile(SensorTable):
     where there are none. `filters`: the known filters that its driver states in a recording of `fieldcal run`.
     `restart`: where its time begins anew, "" where it does not: then it has the clock of no other file."""
 
-    components: tuple[Component, ...] = ()
+    components: tuple[StationChannel, ...] = ()
     filters: tuple[str, ...] = ()
     restart: str = ""
 
@@ -44,7 +44,7 @@ class SensorFile(SensorTable):
 class ReferenceFile(ReferenceTable):
     """The samples of a reference's file. `components` and `filters` as those of a sensor."""
 
-    components: tuple[Component, ...] = ()
+    components: tuple[StationChannel, ...] = ()
     filters: tuple[str, ...] = ()
 
 
@@ -69,8 +69,8 @@ def read_sensor(
 
 
 def _described(
-    source: Source, choice: Choice, chosen: Sequence[Chosen]
-) -> tuple[tuple[str, ...], tuple[Component, ...]]:
+    source: Source, choice: Choice, chosen: Sequence[ChosenColumn]
+) -> tuple[tuple[str, ...], tuple[StationChannel, ...]]:
     """What the user is told, and what the metadata of a station say of the chosen channels."""
     components = source.components if isinstance(source, GroundMotion) else {}
     return (*source.said, *choice.said), tuple(components[c.column] for c in chosen if c.column in components)
@@ -104,7 +104,7 @@ def read_reference(
 
 
 def _rows(
-    source: Source, chosen: Sequence[Chosen], progress: Progress | None, scale: Array
+    source: Source, chosen: Sequence[ChosenColumn], progress: Progress | None, scale: Array
 ) -> tuple[Spooled, Spool, str]:
     """The first of the chosen columns (n,), n >= 2, which are times in s, and the others (n, k) times `scale`; on disk.
 

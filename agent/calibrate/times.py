@@ -8,7 +8,7 @@ import re
 import numpy as np
 
 from agent.reading.source import Array, Source, TableError
-from calib.recorded.choice import Chosen, words
+from calib.recorded.choice import ChosenColumn, words
 from calib.recorded.table import LATEST_STAMP_S, second_of
 from calib.recorded.units import unit_of
 
@@ -40,7 +40,7 @@ class Times:
     `restart`: where the time begins anew, "" where it does not.
     """
 
-    def __init__(self, source: Source, chosen: Chosen) -> None:
+    def __init__(self, source: Source, chosen: ChosenColumn) -> None:
         self._source, self._name = source, str(chosen.column)
         self._guessed: list[str] = []
         unit = unit_of(chosen.unit) if chosen.unit else None

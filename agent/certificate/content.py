@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from agent.calibrate.origin import SourceFile
-from agent.certificate.statements import Statements
+from agent.certificate.statements import CertificateStatements
 from agent.core.events import CalibrationUpdate
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
@@ -25,7 +25,7 @@ class CertificateError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ConformityVerdict:
     """One main sensitivity against the limit: deviation from the nominal one and U, both in %."""
 
     parameter: str
@@ -36,11 +36,11 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Certificate:
+class ResultCertificate:
     """All that the forms of a certificate show. `relative_pct` (12,): U of S in % of the main sensitivity of its row,
     NaN for Q. `levels_mps2`: least and largest rms of the motion in a used window. `seen`: residuals for the figure."""
 
-    stated: Statements
+    stated: CertificateStatements
     number: str
     sensor: str
     result: CalibrationResult
@@ -51,7 +51,7 @@ class Certificate:
     levels_mps2: tuple[float, float] | None
     positions: tuple[str, ...]
     relative_pct: Array
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[ConformityVerdict, ...]
     history: tuple[CalibrationUpdate, ...]
     seen: tuple[Residuals, ...]
 

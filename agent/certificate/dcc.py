@@ -13,8 +13,8 @@ import numpy as np
 
 from agent import __version__
 from agent.calibrate.origin import SourceFile
-from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, Certificate, CertificateError
-from agent.certificate.signing import Signer
+from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, CertificateError, ResultCertificate
+from agent.certificate.signing import CertificateSigner
 from agent.certificate.statements import NOT_IN_XML, Contact
 from agent.config.earlier import COVARIANCE, DCC, PARAMETER_LIST, SI
 from agent.report.units import output_unit
@@ -37,7 +37,7 @@ UNITS = {
 _CLOSING = b"</dcc:digitalCalibrationCertificate>"
 
 
-def dcc(c: Certificate, signer: Signer) -> bytes:
+def dcc(c: ResultCertificate, signer: CertificateSigner) -> bytes:
     """The XML. Its signature is over the bytes of the file without the element dcc:comment. Raises CertificateError."""
     for prefix, space in (("dcc", DCC), ("si", SI)):
         ET.register_namespace(prefix, space)
@@ -55,7 +55,7 @@ def dcc(c: Certificate, signer: Signer) -> bytes:
     return body.removesuffix(_CLOSING) + comment + _CLOSING
 
 
-def _administrative(data: ET.Element, c: Certificate) -> None:
+def _administrative(data: ET.Element, c: ResultCertificate) -> None:
     s = c.stated
     software = _add(_add(data, "dccSoftware"), "software")
     _texts(software, "name", "fieldcal")
@@ -101,7 +101,7 @@ def _output_in_g(unit: str) -> list[tuple[str, str]]:
     return [("output unit", told)]
 
 
-def _conformity(statements: ET.Element, c: Certificate) -> None:
+def _conformity(statements: ET.Element, c: ResultCertificate) -> None:
     decision = c.stated.decision
     for verdict in c.verdicts:
         assert decision is not None
@@ -112,7 +112,7 @@ def _conformity(statements: ET.Element, c: Certificate) -> None:
         _add(statement, "conformity", "pass" if verdict.conforms else "fail")
 
 
-def _measured(results: ET.Element, c: Certificate) -> None:
+def _measured(results: ET.Element, c: ResultCertificate) -> None:
     measured = _add(results, "measurementResult")
     _texts(measured, "name", "S and Q")
     method = _add(_add(measured, "usedMethods"), "usedMethod", refType="basic_calibrationMethod")
@@ -130,7 +130,7 @@ def _measured(results: ET.Element, c: Certificate) -> None:
     _response(listed, c)
 
 
-def _conditions(measured: ET.Element, c: Certificate) -> None:
+def _conditions(measured: ET.Element, c: ResultCertificate) -> None:
     kinds: list[tuple[str, str, Iterable[float] | None]] = [
         ("temperature", r"\degreecelsius", c.temperature_degc),
         ("band in which S holds", r"\hertz", c.result.frequencies.valid_band_hz),
@@ -159,7 +159,7 @@ def _one(value: float | None) -> list[float] | None:
     return None if value is None else [value]
 
 
-def _parameters(data: ET.Element, c: Certificate, known: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> None:
+def _parameters(data: ET.Element, c: ResultCertificate, known: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> None:
     result = c.result
     units = [_unit(result.unit, k) for k in known]
     listed = _list(
@@ -179,7 +179,7 @@ def _parameters(data: ET.Element, c: Certificate, known: np.ndarray[tuple[int, .
     _list(quantity, c.relative_pct[percent], [r"\percent"] * len(percent), [PARAMETERS[k] for k in percent])
 
 
-def _covariance(data: ET.Element, c: Certificate, known: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> None:
+def _covariance(data: ET.Element, c: ResultCertificate, known: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> None:
     """The covariance of the parameters whose covariances are all known."""
     result = c.result
     held = [k for k in known if np.isfinite(result.covariance[k][known]).all()]
@@ -198,7 +198,7 @@ def _covariance(data: ET.Element, c: Certificate, known: np.ndarray[tuple[int, .
     _si(region, "coverageProbability", repr(COVERAGE_PROBABILITY))
 
 
-def _response(listed: ET.Element, c: Certificate) -> None:
+def _response(listed: ET.Element, c: ResultCertificate) -> None:
     """The complex sensitivity in third octaves: for each element of S a list of real and of imaginary parts, and u."""
     bands = c.result.frequencies.bands
     if not bands:

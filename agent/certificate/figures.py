@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
-from agent.certificate.content import MAIN, Certificate
+from agent.certificate.content import MAIN, ResultCertificate
 from agent.report import style
 from agent.report.frequencies import draw_response, has_response
 from agent.report.trace import by_phase
@@ -16,10 +16,10 @@ from agent.report.units import labelled, output_unit, sensitivity_unit
 from agent.terminal.text import figure_text
 
 AXES = "xyz"
-Draw = Callable[[FigureBase, Certificate], None]
+Draw = Callable[[FigureBase, ResultCertificate], None]
 
 
-def figures_of(c: Certificate) -> list[tuple[str, float, Draw]]:
+def figures_of(c: ResultCertificate) -> list[tuple[str, float, Draw]]:
     """Caption, height in inches at the full width of a phone's screen, and the function that draws it."""
     drawn: list[tuple[str, float, Draw]] = [("Main sensitivities with their expanded uncertainties", 2.6, _main)]
     if has_response(c.result):
@@ -37,14 +37,14 @@ def figures_of(c: Certificate) -> list[tuple[str, float, Draw]]:
     return drawn
 
 
-def figure(c: Certificate, height_in: float, draw: Draw) -> Figure:
+def figure(c: ResultCertificate, height_in: float, draw: Draw) -> Figure:
     """One figure by itself."""
     drawn = style.figure(height_in)
     draw(drawn, c)
     return drawn
 
 
-def _main(on: FigureBase, c: Certificate) -> None:
+def _main(on: FigureBase, c: ResultCertificate) -> None:
     result = c.result.shown
     subplots = on.subplots(3, 1)
     for k, axes in enumerate(subplots):
@@ -60,11 +60,11 @@ def _main(on: FigureBase, c: Certificate) -> None:
     subplots[-1].set_xlabel(labelled("S", figure_text(sensitivity_unit(result.unit))))
 
 
-def _response(on: FigureBase, c: Certificate) -> None:
+def _response(on: FigureBase, c: ResultCertificate) -> None:
     draw_response(on, c.result)
 
 
-def _history(on: FigureBase, c: Certificate) -> None:
+def _history(on: FigureBase, c: ResultCertificate) -> None:
     axes = on.subplots()
     days = np.array([update.date_utc_ns for update in c.history]) / 86_400e9
     S = np.array([np.diag(update.sensitivity) for update in c.history])
@@ -75,7 +75,7 @@ def _history(on: FigureBase, c: Certificate) -> None:
     axes.legend(ncols=3, **style.ABOVE)
 
 
-def _residuals(on: FigureBase, c: Certificate) -> None:
+def _residuals(on: FigureBase, c: ResultCertificate) -> None:
     axes: Axes = on.subplots()
     seen = next(r for r in reversed(c.seen) if r.phase_rad is not None)
     assert seen.phase_rad is not None

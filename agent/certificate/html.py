@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from importlib.resources import files
 
 from agent.certificate import wording
-from agent.certificate.content import Certificate
+from agent.certificate.content import ResultCertificate
 from agent.certificate.figures import figure, figures_of
 from agent.report import style, tables
 from agent.terminal.text import page_text
 
 
-def page(c: Certificate, signature: str) -> str:
+def page(c: ResultCertificate, signature: str) -> str:
     """The whole page. Its policy (CSP) allows only its own style, by its hash, and pictures inside the page."""
     css = "\n" + files("agent.report").joinpath("page.css").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(css.encode()).digest()).decode()
@@ -28,7 +28,7 @@ def page(c: Certificate, signature: str) -> str:
     )
 
 
-def _body(c: Certificate, signature: str) -> Iterator[str]:
+def _body(c: ResultCertificate, signature: str) -> Iterator[str]:
     yield f"<h1>{page_text(c.stated.title)}</h1>"
     for section in wording.before_results(c, signature):
         yield _section(section)
@@ -45,6 +45,6 @@ def _body(c: Certificate, signature: str) -> Iterator[str]:
     yield "</div>"
 
 
-def _section(section: wording.Section) -> str:
+def _section(section: wording.CertificateSection) -> str:
     table = tables.table(("", ""), section.rows, "words", frozenset({1}))
     return f"<h2>{page_text(section.heading)}</h2>{table}"

@@ -13,9 +13,16 @@ import numpy as np
 
 from agent import __version__
 from agent.calibrate.origin import SourceFile, source_file
-from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, MAIN, Certificate, CertificateError, Verdict
+from agent.certificate.content import (
+    COVERAGE_PROBABILITY,
+    EQUATION,
+    MAIN,
+    CertificateError,
+    ConformityVerdict,
+    ResultCertificate,
+)
 from agent.certificate.provenance import graph
-from agent.certificate.statements import Decision, Statements
+from agent.certificate.statements import CertificateStatements, DecisionRule
 from agent.core.events import CalibrationUpdate
 from agent.report.material import Material, MaterialError
 from agent.report.result import CalibrationResult, plain
@@ -27,7 +34,9 @@ from calib.recorded.units import unit_name
 FORMAT = 1  # of certificate.json
 
 
-def certificate_of(material: Material, stated: Statements, beside: Path, seen: Iterable[Residuals]) -> Certificate:
+def certificate_of(
+    material: Material, stated: CertificateStatements, beside: Path, seen: Iterable[Residuals]
+) -> ResultCertificate:
     """The certificate of the first result. `beside`: directory of certificate.toml. Raises CertificateError and
     MaterialError."""
     result = material.results[0]
@@ -40,7 +49,7 @@ def certificate_of(material: Material, stated: Statements, beside: Path, seen: I
         raise MaterialError(
             f"{source}: expanded_uncertainty, covariance: the result has none; make it again with `fieldcal calibrate`"
         )
-    found = Certificate(
+    found = ResultCertificate(
         stated=stated, number=stated.number, sensor=material.sensor, result=result,
         reference_file=_reference_file(stated.reference.certificate_file, beside), files=tuple(material.files),
         temperature_degc=_temperature(stated, material.history), frequency_hz=_frequencies(residuals),
@@ -55,7 +64,7 @@ def certificate_of(material: Material, stated: Statements, beside: Path, seen: I
     return replace(found, number=f"FC-{stated.dates.issued}-{digest[:12]}")
 
 
-def as_object(certificate: Certificate) -> dict[str, Any]:
+def as_object(certificate: ResultCertificate) -> dict[str, Any]:
     """The member `certificate` of certificate.json."""
     c, result = certificate, certificate.result
     told = result.fields
@@ -112,7 +121,7 @@ def _unit(told: str, stated: str, source: str) -> str:
     return told or named
 
 
-def _named(stated: Statements, quantity: object) -> Statements:
+def _named(stated: CertificateStatements, quantity: object) -> CertificateStatements:
     """The statements with a name of the reference, by what it gives, where none is stated."""
     named = stated.reference.name or reference_name(quantity)
     return stated.model_copy(update={"reference": stated.reference.model_copy(update={"name": named})})
@@ -133,7 +142,7 @@ def replace_path(file: SourceFile, name: str) -> SourceFile:
     return SourceFile(name, file.size_bytes, file.sha256)
 
 
-def _temperature(stated: Statements, history: list[CalibrationUpdate]) -> tuple[float, float] | None:
+def _temperature(stated: CertificateStatements, history: list[CalibrationUpdate]) -> tuple[float, float] | None:
     low, high = stated.conditions.temperature_low_degc, stated.conditions.temperature_high_degc
     if low is not None and high is not None:
         return low, high
@@ -165,7 +174,7 @@ def _relative(result: CalibrationResult) -> Array:
     return np.append(100.0 * result.expanded_uncertainty[:9] / main, np.full(3, np.nan))
 
 
-def _verdicts(shown: CalibrationResult, decision: Decision | None) -> tuple[Verdict, ...]:
+def _verdicts(shown: CalibrationResult, decision: DecisionRule | None) -> tuple[ConformityVerdict, ...]:
     if decision is None:
         return ()
     found = []
@@ -174,5 +183,5 @@ def _verdicts(shown: CalibrationResult, decision: Decision | None) -> tuple[Verd
         deviation, U = 100.0 * (value / decision.nominal - 1.0), 100.0 * expanded / decision.nominal
         guard = U if decision.rule == "guard band" else 0.0
         conforms = bool(abs(deviation) + guard <= decision.limit_pct)  # NaN, for what is not known, does not conform
-        found.append(Verdict(PARAMETERS[k], float(deviation), float(U), decision.limit_pct, conforms))
+        found.append(ConformityVerdict(PARAMETERS[k], float(deviation), float(U), decision.limit_pct, conforms))
     return tuple(found)

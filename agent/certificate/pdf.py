@@ -14,7 +14,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
 from agent.certificate import wording
-from agent.certificate.content import Certificate
+from agent.certificate.content import ResultCertificate
 from agent.certificate.figures import figures_of
 from agent.report import style
 from agent.terminal.text import one_line
@@ -28,12 +28,12 @@ SOFT = "#5a6472"
 SMALL: Any = {"font.size": 7, "axes.labelsize": 7, "xtick.labelsize": 6, "ytick.labelsize": 6, "legend.fontsize": 6}
 
 
-def pdf(c: Certificate, signature: str) -> bytes:
+def pdf(c: ResultCertificate, signature: str) -> bytes:
     """The pages: two, unless the stated texts are long. A letter that the font does not have is a box."""
     # Type 42 fonts have whole letters, so the text can be searched.
     with style.drawing(), rc_context({"pdf.fonttype": 42}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
-        sheets = _Sheets(c)
+        sheets = _Pages(c)
         for section in wording.before_results(c, signature):
             sheets.section(section)
         sheets.table("Results", wording.HEADS, wording.parameters(c))
@@ -48,10 +48,10 @@ def pdf(c: Certificate, signature: str) -> bytes:
         return buffer.getvalue()
 
 
-class _Sheets:
+class _Pages:
     """Pages that are filled from top to bottom; `_y` is the next line's base in points from the page's lower edge."""
 
-    def __init__(self, c: Certificate) -> None:
+    def __init__(self, c: ResultCertificate) -> None:
         self._number = c.number
         self._pages: list[Figure] = []
         self.turn()
@@ -63,7 +63,7 @@ class _Sheets:
         self._pages.append(Figure(figsize=(WIDTH_PT / 72.0, HEIGHT_PT / 72.0)))
         self._y = HEIGHT_PT - MARGIN_PT - 10.0
 
-    def section(self, section: wording.Section) -> None:
+    def section(self, section: wording.CertificateSection) -> None:
         """A heading and its rows; a row that is too long for one line takes several."""
         self._heading(section.heading)
         for name, text in section.rows:
@@ -84,7 +84,7 @@ class _Sheets:
                 self._text(MARGIN_PT + x, text, color=SOFT if k == 0 else style.INK)
             self._y -= LEADING_PT
 
-    def figures(self, c: Certificate) -> None:
+    def figures(self, c: ResultCertificate) -> None:
         """Two figures side by side in a row, each with its caption."""
         drawn = figures_of(c)
         for first in range(0, len(drawn), 2):

@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 
 from agent import __version__
-from agent.certificate.content import Certificate
+from agent.certificate.content import ResultCertificate
 
 PREFIX = {"fieldcal": "https://fieldcal.invalid/", "sha256": "urn:hash:sha256:"}  # .invalid: nothing is there
 CALIBRATION, SOFTWARE = "fieldcal:calibration", "fieldcal:program"
 
 
-def graph(c: Certificate, result: dict[str, Any]) -> dict[str, Any]:
+def graph(c: ResultCertificate, result: dict[str, Any]) -> dict[str, Any]:
     """The PROV-JSON. `result` is that of certificate.json; its entity is named by the SHA-256 of its JSON.
 
     A file or window is named by its SHA-256 too. The names of instruments are their serial numbers.

@@ -42,7 +42,7 @@ class RecallError(Exception):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class IssuedResult:
     """A result: where it is, S and Q (12,) with covariance and k, and what it owes to its references.
 
     `name`: sensor, or file without its ending. `made`: run and sequence, or the SHA-256 of the file. `stated`: the
@@ -77,7 +77,7 @@ def _words(reference: str) -> list[str]:
     return reference.replace(",", " ").split()
 
 
-def results_in(path: Path) -> Iterator[Found]:
+def results_in(path: Path) -> Iterator[IssuedResult]:
     """The calibrations in a data directory, in a recording, or in a JSON of `calibrate` or `certificate`.
 
     Raises RecallError, StoreError and OSError.
@@ -93,14 +93,14 @@ def results_in(path: Path) -> Iterator[Found]:
         return
     for update in updates:
         if isinstance(update, CalibrationUpdate):
-            yield Found(
+            yield IssuedResult(
                 str(path), update.sensor, update.made, np.append(np.ravel(update.sensitivity), update.offset),
                 np.array(update.covariance), np.full(12, update.coverage_factor), tuple(update.shared_errors),
                 tuple(update.references),
             )  # fmt: skip
 
 
-def _of_json(path: Path) -> Found:
+def _of_json(path: Path) -> IssuedResult:
     try:
         told: dict[str, Any] = msgspec.json.decode(read_file(path, LARGEST_RESULT), type=dict[str, Any])
         certificate, stated = told.get("certificate"), ""
@@ -116,13 +116,13 @@ def _of_json(path: Path) -> Found:
             f"{path}: neither a JSON of `fieldcal calibrate` or `fieldcal certificate`, nor a recording, nor a data "
             f"directory: {error}"
         ) from None
-    return Found(
+    return IssuedResult(
         str(path), path.stem, (source_file(path).sha256, 0), result.values, result.covariance,
         result.coverage_factor, tuple(shared), stated=str(stated),
     )  # fmt: skip
 
 
-def corrected(found: Found, shared: SharedError, new: ReferenceCertificate) -> tuple[Array, Array]:
+def corrected(found: IssuedResult, shared: SharedError, new: ReferenceCertificate) -> tuple[Array, Array]:
     """S and Q (12,) and their covariance (12, 12) by the new certificate. Raises RecallError."""
     share = ReferenceShare(
         shared.reference, np.array(shared.sensitivity), tuple(shared.unknowns), tuple(shared.kinds),
@@ -140,7 +140,7 @@ def corrected(found: Found, shared: SharedError, new: ReferenceCertificate) -> t
         ) from None
 
 
-def recalled(results: Sequence[Found], serial_number: str, new: ReferenceCertificate) -> list[dict[str, Any]]:
+def recalled(results: Sequence[IssuedResult], serial_number: str, new: ReferenceCertificate) -> list[dict[str, Any]]:
     """The corrected results, each an object for its file; those that cannot be corrected have `corrected` null.
 
     A calibration that is in several inputs, or that came into force again, is corrected once.
@@ -154,7 +154,9 @@ def recalled(results: Sequence[Found], serial_number: str, new: ReferenceCertifi
     return found
 
 
-def _object(result: Found, shared: SharedError | None, serial_number: str, new: ReferenceCertificate) -> dict[str, Any]:
+def _object(
+    result: IssuedResult, shared: SharedError | None, serial_number: str, new: ReferenceCertificate
+) -> dict[str, Any]:
     before = _numbers(result)
     after, change = None, None
     if shared is not None:
@@ -189,7 +191,7 @@ def _object(result: Found, shared: SharedError | None, serial_number: str, new: 
     }
 
 
-def _numbers(result: Found) -> dict[str, Any]:
+def _numbers(result: IssuedResult) -> dict[str, Any]:
     u = np.sqrt(np.diag(result.covariance))
     return {
         **_parts(result.values),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 PURPOSE = "fieldcal certificate 1"
 
 
-class Signer:
+class CertificateSigner:
     """Signs the parts of one certificate; without a key the parts stay unsigned."""
 
     def __init__(self, key: Ed25519PrivateKey | None, number: str) -> None:
@@ -39,7 +39,7 @@ class Signer:
         return msgspec.json.encode(sign(self._key, written(PURPOSE, {"number": self._number, **digests})))
 
 
-def as_json(body: bytes, signer: Signer) -> bytes:
+def as_json(body: bytes, signer: CertificateSigner) -> bytes:
     """certificate.json: `body`, the JSON of the content, with the signature over exactly these bytes, or null."""
     return b'{"certificate":' + body + b',\n"signature":' + (signer.sign({"certificate": body}) or b"null") + b"}\n"
 

@@ -133,7 +133,7 @@ class Conditions(Section):
         return self
 
 
-class Decision(Section):
+class DecisionRule(Section):
     """A limit for the main sensitivities, in % of `nominal` (output unit per m/s2), and how U is taken into account.
 
     `simple acceptance`: the deviation is at most the limit. `guard band`: deviation and U together are at most the
@@ -152,7 +152,7 @@ class Accreditation(Section):
     number: Line
 
 
-class Statements(Section):
+class CertificateStatements(Section):
     """The whole file. `number` is left out: the certificate is numbered by its content."""
 
     title: Line = FIELD_TITLE
@@ -165,6 +165,6 @@ class Statements(Section):
     place: Place
     dates: Dates
     conditions: Conditions = Conditions()
-    decision: Decision | None = None
+    decision: DecisionRule | None = None
     accreditation: Accreditation | None = None
     remarks: Annotated[tuple[Line, ...], Field(max_length=5)] = ()

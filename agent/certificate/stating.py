@@ -10,9 +10,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from agent.certificate.statements import Dates, Statements
+from agent.certificate.statements import CertificateStatements, Dates
 from agent.config.reading import ConfigError, check_model, read_toml
-from agent.setup.asking import Asking
+from agent.setup.asking import Interview
 from agent.setup.toml import toml_value
 
 OPTION = "--state"
@@ -22,7 +22,9 @@ WITHOUT_FILE = (
 )
 
 
-def gather_statements(path: Path | None, entries: Sequence[str], asking: Asking) -> tuple[Statements, str]:
+def gather_statements(
+    path: Path | None, entries: Sequence[str], asking: Interview
+) -> tuple[CertificateStatements, str]:
     """The statements of the file `path`, if there is one; `entries` such as "customer.name=Bridge Operator" add to it
     or replace what it says; on a terminal what is missing then is asked.
 
@@ -31,20 +33,20 @@ def gather_statements(path: Path | None, entries: Sequence[str], asking: Asking)
     """
     raw, text = ({}, "") if path is None else read_toml(path)
     if path is not None and not entries:
-        return check_model(raw, Statements, str(path), text), ""
+        return check_model(raw, CertificateStatements, str(path), text), ""
     for entry in entries:
         name, equals, value = entry.partition("=")
         if not equals or not all(name.split(".")):
             raise ConfigError([f"{OPTION} {entry}: write ENTRY=VALUE, as in customer.city=Pescara"])
         _put(raw, name.strip().split("."), _value(value.strip()))
-    for place, model in list(_missing(Statements, raw, ())):
+    for place, model in list(_missing(CertificateStatements, raw, ())):
         name = ".".join(place)
         default = f"{datetime.now(UTC):%Y-%m-%d}" if model is Dates and asking.interactive else None
         told = asking.value(f"{OPTION} {name}=...", None, f"{name} (docs/certificate.md)", default)
         _put(raw, place, told.value)
     if asking.faults:
         raise ConfigError(asking.faults if path or entries else [WITHOUT_FILE, *asking.faults])
-    return check_model(raw, Statements, OPTION if path is None else f"{path} with {OPTION}"), _text(raw)
+    return check_model(raw, CertificateStatements, OPTION if path is None else f"{path} with {OPTION}"), _text(raw)
 
 
 def _missing(

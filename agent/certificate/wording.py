@@ -9,7 +9,7 @@ import numpy as np
 
 from agent import __version__
 from agent.calibrate.origin import SourceFile
-from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, Certificate
+from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, ResultCertificate
 from agent.report.tables import number
 from agent.report.units import offset_unit, position_name, sensitivity_unit
 from calib.model import PARAMETERS
@@ -22,20 +22,20 @@ HEADS = ("", "value ± U", "unit", "U in %", "k", "degrees of freedom")
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class CertificateSection:
     """A heading with its rows of name and text."""
 
     heading: str
     rows: Rows
 
 
-def before_results(c: Certificate, signature: str) -> Iterator[Section]:
+def before_results(c: ResultCertificate, signature: str) -> Iterator[CertificateSection]:
     """All that stands before the results."""
     s = c.stated
     if c.result.warnings:
-        yield Section("Warnings", [("warning", warning) for warning in c.result.warnings])
+        yield CertificateSection("Warnings", [("warning", warning) for warning in c.result.warnings])
     role = f", {s.operator.role}" if s.operator.role else ""
-    yield Section("Certificate", [
+    yield CertificateSection("Certificate", [
         ("number", c.number),
         ("issued by", f"{s.organisation.name}, {s.organisation.address}"),
         ("responsible", f"{s.operator.name}{role}"),
@@ -46,7 +46,7 @@ def before_results(c: Certificate, signature: str) -> Iterator[Section]:
         ("signature", signature),
     ])  # fmt: skip
     i, r = s.instrument, s.reference
-    yield Section("Sensor and reference", [
+    yield CertificateSection("Sensor and reference", [
         ("sensor", f"{i.name}: {i.manufacturer} {i.model}, serial number {i.serial_number}"),
         *([("identity", str(c.result.fields["identity"]))] if c.result.fields.get("identity") else []),
         ("reference", f"{r.name}: {r.manufacturer} {r.model}, serial number {r.serial_number}"),
@@ -55,10 +55,10 @@ def before_results(c: Certificate, signature: str) -> Iterator[Section]:
         *([("its error", "all results of this reference share it; certificate.json has the derivatives by it")]
           if c.result.fields.get("shared_errors") else []),
     ])  # fmt: skip
-    yield Section("Method and conditions", list(_conditions(c)))
+    yield CertificateSection("Method and conditions", list(_conditions(c)))
 
 
-def after_results(c: Certificate) -> Iterator[Section]:
+def after_results(c: ResultCertificate) -> Iterator[CertificateSection]:
     """What the results mean, and where they come from."""
     rows = [
         ("U", f"expanded uncertainty with the stated k: a coverage probability of {100 * COVERAGE_PROBABILITY:.2f} %"),
@@ -69,19 +69,19 @@ def after_results(c: Certificate) -> Iterator[Section]:
     if not c.result.determined.all():
         names = [name for name, known in zip(PARAMETERS, c.result.determined, strict=True) if not known]
         rows.append(("not determined", f"by the data: {', '.join(names)}; a value is what was known before"))
-    yield Section("How to read the results", rows)
+    yield CertificateSection("How to read the results", rows)
     decision = c.stated.decision
     if decision is not None:
         U = "deviation and U together are" if decision.rule == "guard band" else "the deviation is"
         unit = sensitivity_unit(c.result.unit)
         limit = f"at most {decision.limit_pct:g} % of {decision.nominal:g}{'' if unit == '1' else f' {unit}'}"
-        yield Section("Conformity", [("decision rule", f"{decision.rule}: {U} {limit}"), *[
+        yield CertificateSection("Conformity", [("decision rule", f"{decision.rule}: {U} {limit}"), *[
             (v.parameter, f"deviation {v.deviation_pct:+.2f} %, U {v.expanded_uncertainty_pct:.2f} %: "
                           f"{'conforms' if v.conforms else 'does not conform'}")
             for v in c.verdicts
         ]])  # fmt: skip
     engine = c.result.fields.get("engine")
-    yield Section("Origin", [
+    yield CertificateSection("Origin", [
         *[("made from", _file(file)) for file in c.files[:MOST_FILES]],
         *([("and", f"{len(c.files) - MOST_FILES} more files, see certificate.json")] if len(c.files) > MOST_FILES
           else []),
@@ -91,7 +91,7 @@ def after_results(c: Certificate) -> Iterator[Section]:
     ])  # fmt: skip
 
 
-def parameters(c: Certificate) -> list[tuple[str, ...]]:
+def parameters(c: ResultCertificate) -> list[tuple[str, ...]]:
     """A row for each parameter, under HEADS."""
     result = c.result.shown
     units = [sensitivity_unit(result.unit)] * 9 + [offset_unit(result.unit)] * 3
@@ -109,13 +109,13 @@ def parameters(c: Certificate) -> list[tuple[str, ...]]:
     ]
 
 
-def _dates(c: Certificate) -> str:
+def _dates(c: ResultCertificate) -> str:
     d = c.stated.dates
     received = f"received {d.received}, " if d.received else ""
     return f"{received}calibrated {d.begun} to {d.ended}, issued {d.issued}"
 
 
-def _conditions(c: Certificate) -> Iterator[tuple[str, str]]:
+def _conditions(c: ResultCertificate) -> Iterator[tuple[str, str]]:
     yield "method", c.method
     yield "equation", f"{EQUATION}; V indication, a acceleration, S sensitivity, Q offset"
     t = c.temperature_degc
@@ -138,7 +138,7 @@ def _conditions(c: Certificate) -> Iterator[tuple[str, str]]:
         yield "other", c.stated.conditions.other
 
 
-def _used(c: Certificate) -> int:
+def _used(c: ResultCertificate) -> int:
     return sum(window.used for window in c.result.windows)
 
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from agent.certificate.content import Certificate
+from agent.certificate.content import ResultCertificate
 from agent.certificate.dcc import dcc
 from agent.certificate.html import page
 from agent.certificate.making import as_object
 from agent.certificate.pdf import pdf
 from agent.certificate.schema import check_schema
-from agent.certificate.signing import Signer, as_json
+from agent.certificate.signing import CertificateSigner, as_json
 from agent.certificate.x509 import X509Signer
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ NAME = "certificate"
 
 
 def write(
-    c: Certificate,
+    c: ResultCertificate,
     directory: Path,
     key: Ed25519PrivateKey | None,
     xsd: Path | None = None,
@@ -34,7 +34,7 @@ def write(
     With `xsd`, the schema of the DCC, the XML must be valid. Raises OSError, CertificateError and SchemaError; with the
     latter two nothing is written.
     """
-    signer = Signer(key, c.number)
+    signer = CertificateSigner(key, c.number)
     xml = dcc(c, signer)  # the only form that can refuse a content, so it is made first
     if xsd is not None:
         check_schema(xml, xsd)

@@ -20,10 +20,10 @@ from agent.audit.replaying import Replayer
 from agent.audit.replaying import link as link_replays
 from agent.cli.data_dir import DATA_DIR, files_or
 from agent.cli.engine_options import ENGINES, JOBS, TRUST_ENGINE, engines_for
-from agent.cli.given import Given, add_witnessed, read_head, recordings_of
+from agent.cli.given import GivenFiles, add_witnessed, read_head, recordings_of
 from agent.cli.kernels import compute_as_in
 from agent.delivery.history import StoreError
-from agent.recording.chain import Link, chain_faults, missing_after, unproven
+from agent.recording.chain import ChainLink, chain_faults, missing_after, unproven
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.end_check import End, check_end
 from agent.recording.gone import Gone, find_gone
@@ -127,7 +127,7 @@ def _known(public_key: Path | None, known_keys: Path | None) -> KnownKeys | None
     return replace(listed, anywhere=anywhere)
 
 
-def _is_signed(links: Sequence[Link]) -> bool:
+def _is_signed(links: Sequence[ChainLink]) -> bool:
     """Whether the newest recording is."""
     return bool(links) and links[-1].signed_results is not None
 
@@ -151,7 +151,7 @@ def _unproven(audited: Sequence[AuditedFile], keys: KnownKeys | None) -> list[st
 
 
 def run_audit(
-    given: Given,
+    given: GivenFiles,
     engines: Engines,
     *,
     as_json: bool,
@@ -194,15 +194,15 @@ def _as_object(audited: Sequence[AuditedFile], end: End, lost: str, *, ok: bool)
 
 
 def audit_files(
-    given: Given, engines: Engines, *, strict: bool = False, keys: KnownKeys | None = None
+    given: GivenFiles, engines: Engines, *, strict: bool = False, keys: KnownKeys | None = None
 ) -> list[AuditedFile]:
     """The verdict on each file. Each file is also compared with the one before it. Raises OSError."""
     return _audited(given, engines, strict=strict, keys=keys, jobs=1)[0]
 
 
 def _audited(
-    given: Given, engines: Engines, *, strict: bool, keys: KnownKeys | None, jobs: int
-) -> tuple[list[AuditedFile], list[Link], Gone]:
+    given: GivenFiles, engines: Engines, *, strict: bool, keys: KnownKeys | None, jobs: int
+) -> tuple[list[AuditedFile], list[ChainLink], Gone]:
     """(the verdicts, the links of the chain, what is known of recordings that are not there)."""
     from agent.recording.fingerprint import fingerprint
 

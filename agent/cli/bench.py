@@ -21,17 +21,17 @@ from agent.terminal.text import say
 if TYPE_CHECKING:
     from agent.bench.capture import Capture
     from agent.bench.measuring import Measuring
-    from agent.bench.screen import Screen
-    from agent.bench.session import Session
-    from agent.bench.stops import Stop
+    from agent.bench.screen import BenchScreen
+    from agent.bench.session import BenchSession
+    from agent.bench.stops import BenchStop
     from agent.delivery.guide import Guide
     from agent.delivery.guide_publication import GuidePublisher
-    from calib.visit.next_stop import Wanted
+    from calib.visit.next_stop import WantedUncertainty
 
 FIRST_S = 2.0  # of samples that tell how much the shaker moves
 THETAS_DEG, ALPHA_STEP_DEG = "35,55", 15
 U_MAIN_PCT, U_TRANSVERSE_PCT = 0.05, 0.25
-Turn = Callable[["Stop"], float]
+Turn = Callable[["BenchStop"], float]
 
 
 class _Angles(click.ParamType):  # type: ignore[type-arg]
@@ -161,14 +161,14 @@ def _led(
     from agent.bench.capture import Capture
     from agent.bench.kinds import stated, stops_of, write_prior
     from agent.bench.measuring import Measuring
-    from agent.bench.screen import Screen
+    from agent.bench.screen import BenchScreen
     from agent.calibrate.stated import options_of
-    from calib.visit.next_stop import Wanted
+    from calib.visit.next_stop import WantedUncertainty
 
     stops = stops_of(channel, options["thetas"], options["alphas"])
     devices = [channel.sensor, *([channel.reference] if channel.reference else [])]
-    wanted, status = Wanted(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0), 1
-    screen = Screen(channel.sensor, wanted, ask, say, progress, publish)
+    wanted, status = WantedUncertainty(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0), 1
+    screen = BenchScreen(channel.sensor, wanted, ask, say, progress, publish)
     try:
         with Capture(settings, devices) as capture:
             info = opened(capture, devices)
@@ -191,22 +191,24 @@ def _led(
         screen.ended(output, status)
 
 
-def _begun(stops: list[Stop], measuring: Measuring, wanted: Wanted, scale: float, capture: Capture) -> Session:
+def _begun(
+    stops: list[BenchStop], measuring: Measuring, wanted: WantedUncertainty, scale: float, capture: Capture
+) -> BenchSession:
     """A session that knows how much the reference moves."""
-    from agent.bench.session import START, Session
+    from agent.bench.session import START, BenchSession
     from calib.excitation.band_to_keep import LEAST_MOTION_MPS2
 
     time.sleep(FIRST_S)
     moved = measuring.moved_mps2(capture.record(capture.now_s - FIRST_S))
     expected = replace(START, rms_mps2=moved) if moved > LEAST_MOTION_MPS2 else START
-    return Session(stops, measuring.priors, wanted, scale, expected)
+    return BenchSession(stops, measuring.priors, wanted, scale, expected)
 
 
 def _measured(
-    session: Session,
+    session: BenchSession,
     measuring: Measuring,
     capture: Capture,
-    screen: Screen,
+    screen: BenchScreen,
     output: Path,
     options: dict[str, Any],
     turn: Turn | None,
@@ -214,10 +216,10 @@ def _measured(
 ) -> bool:
     """Whether stops were taken; their samples are then in the directory, also after Ctrl-C."""
     from agent.bench.aside import Aside
-    from agent.bench.dialogue import Dialogue, Stay
+    from agent.bench.dialogue import Dialogue, StopStay
     from agent.bench.thinking import Thinking
 
-    stay = Stay(options["stay_s"], max(options["most_s"], options["stay_s"]))
+    stay = StopStay(options["stay_s"], max(options["most_s"], options["stay_s"]))
     with Aside() as aside:
         dialogue = Dialogue(Thinking(session, measuring, aside), capture, stay, screen, turn)
         try:
@@ -258,7 +260,7 @@ def _virtual_bench(
         raw = {"gateway": {"site": "virtual", "name": "bench"}, "devices": devices, "channels": [channel],
                "zenoh": {"connect": routers}}  # fmt: skip
 
-        def turn(stop: Stop) -> float:
+        def turn(stop: BenchStop) -> float:
             held_s, columns = float("inf"), np.array(list(stop.columns.values()))
             return live.turn(clamped(columns[0], columns[1], held_s) if on_clamp else resting(columns, held_s))
 

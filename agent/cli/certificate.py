@@ -70,7 +70,7 @@ def make(
     from agent.certificate.x509 import X509Signer
     from agent.report.material import MaterialError, gather
     from agent.report.writing import left_over
-    from agent.setup.asking import Asking
+    from agent.setup.asking import Interview
 
     try:
         private = None if key is None else load_private_key(key)
@@ -80,7 +80,7 @@ def make(
             raise MaterialError("a certificate is of one result; give one RESULT.json")
         if material.results[0].refused:
             return _refused(material.results[0].reasons)
-        told, text = gather_statements(stated, entries, Asking())
+        told, text = gather_statements(stated, entries, Interview())
         beside = Path() if stated is None else stated.parent
         written = write(certificate_of(material, told, beside, left_over(material)), output, private, xsd, x509)
         written += _kept(text, output / "certificate.toml", stated)

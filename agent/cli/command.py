@@ -26,7 +26,7 @@ from agent.terminal.text import say
 VALID_S = 60.0  # s; a command takes effect when it arrives, or not at all
 
 
-class _Answer(msgspec.Struct):
+class _CommandAnswer(msgspec.Struct):
     taken: bool
     reason: str = ""
 
@@ -151,7 +151,7 @@ def _run(
         else:
             with LocalAgent(data_dir) as agent:
                 said = agent.send(address, sealed(gateway or agent.gateway))
-        answer = msgspec.json.decode(said, type=_Answer)
+        answer = msgspec.json.decode(said, type=_CommandAnswer)
     except EndpointError as error:
         raise click.UsageError(str(error)) from None
     except (OSError, msgspec.DecodeError, ValueError) as error:

@@ -14,7 +14,7 @@ from agent.cli.rules import check_rules
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
-    from agent.export.samples import Content
+    from agent.export.samples import RecordedContent
     from agent.export.smoothing import Smoothed
 
 ENDINGS = (".csv", ".parquet", ".uff", ".mseed")
@@ -125,7 +125,9 @@ def _check(
     )  # fmt: skip
 
 
-def _write(recordings: Sequence[Path], content: Content, to: Path | None, mcap: Path | None, rate_hz: float) -> None:
+def _write(
+    recordings: Sequence[Path], content: RecordedContent, to: Path | None, mcap: Path | None, rate_hz: float
+) -> None:
     """Write the files. Raises ExportError, OSError."""
     from agent.export.plots import write_plots
     from agent.export.samples import samples
@@ -142,7 +144,7 @@ def _write(recordings: Sequence[Path], content: Content, to: Path | None, mcap: 
         say(f"{mcap}: {count} messages of {content.device} at {rate_hz:g} Hz")
 
 
-def _check_axes(recordings: Sequence[Path], content: Content) -> None:
+def _check_axes(recordings: Sequence[Path], content: RecordedContent) -> None:
     """Raise ExportError for a device without S and Q; go on with the kernels of the recordings."""
     from agent.cli.kernels import compute_as_in
     from agent.export.samples import ExportError
@@ -153,14 +155,18 @@ def _check_axes(recordings: Sequence[Path], content: Content) -> None:
 
 
 def _write_epochs(
-    recordings: Sequence[Path], content: Content, to: Path, place: tuple[float, float, float], data_dir: Path | None
+    recordings: Sequence[Path],
+    content: RecordedContent,
+    to: Path,
+    place: tuple[float, float, float],
+    data_dir: Path | None,
 ) -> None:
     """Write the epochs of the past as StationXML. Raises ExportError, StoreError, OSError."""
     from agent.delivery.history import FILE_NAME, History
     from agent.export.past import pasts, pasts_of
     from agent.export.samples import samples, start_of
     from agent.export.seismic import rate_of
-    from agent.export.stationxml import Place, write_stationxml
+    from agent.export.stationxml import StationPlace, write_stationxml
 
     if data_dir is None:
         found = pasts_of(recordings, [])
@@ -172,11 +178,11 @@ def _write_epochs(
     own = [one for one in found if one.sensor == content.device]
     rate_hz = next(map(rate_of, samples(recordings, content)), 0.0)
     site = start_of(recordings[0]).site
-    count = write_stationxml(to, content, own, site=site, rate_hz=rate_hz, place=Place(*place))
+    count = write_stationxml(to, content, own, site=site, rate_hz=rate_hz, place=StationPlace(*place))
     say(f"{to}: {count} epochs of {content.device}")
 
 
-def _smoothed(recordings: Sequence[Path], content: Content, data_dir: Path | None) -> Smoothed:
+def _smoothed(recordings: Sequence[Path], content: RecordedContent, data_dir: Path | None) -> Smoothed:
     """The past by the states where the recordings end, or by those in a data directory."""
     from agent.delivery.history import FILE_NAME, History
     from agent.export.at_the_end import memories_at_the_end

@@ -11,7 +11,7 @@ COMMANDS = {
 }  # fmt: skip
 
 
-class _Commands(click.Group):
+class _LazyCommands(click.Group):
     """Loads a command's module only when the command is called."""
 
     def list_commands(self, _: click.Context) -> list[str]:
@@ -25,6 +25,6 @@ class _Commands(click.Group):
         return command
 
 
-@click.group(cls=_Commands)
+@click.group(cls=_LazyCommands)
 def fleet() -> None:
     """All devices of a site together."""

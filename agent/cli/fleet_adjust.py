@@ -16,7 +16,7 @@ from agent.fleet.site_file import SiteSection, arguments_of, load_site
 from agent.fleet.telling import as_json, as_object, reasons, show, write
 from agent.reading.source import TableError
 from agent.terminal.text import say
-from calib.site_adjustment.device import Device
+from calib.site_adjustment.device import SiteDevice
 
 
 @click.command()
@@ -72,7 +72,7 @@ class _NothingError(Exception):
     """No meeting can be used; one line for each."""
 
 
-def _met_in(sources: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
+def _met_in(sources: Sequence[Path]) -> tuple[list[SiteDevice], list[Meeting]]:
     """The devices and meetings of a site, from its file or from recordings."""
     described = [path for path in sources if path.suffix == ".toml"]
     if not described:
@@ -84,7 +84,7 @@ def _met_in(sources: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
     return [device(name, section, directory, meetings) for name, section in site.devices.items()], meetings
 
 
-def _adjusted(devices: Sequence[Device], meetings: Sequence[Meeting]) -> Adjusted:
+def _adjusted(devices: Sequence[SiteDevice], meetings: Sequence[Meeting]) -> Adjusted:
     if all(m.found is None for m in meetings):
         raise _NothingError([f"{m.sensor} beside {m.reference or 'gravity'}: {m.reasons[0]}" for m in meetings])
     return adjusted(devices, meetings)

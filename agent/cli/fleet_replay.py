@@ -49,7 +49,7 @@ def replay(
     Exit status: 0 all passed, 3 a recording was refused or cannot be read (the others are computed), 2 bad usage.
     """
     from agent.fleet.results import results_of
-    from agent.fleet.settings import Setting, SettingError
+    from agent.fleet.settings import ChangedSetting, SettingError
     from agent.fleet.sources import SourceError, found
     from agent.fleet.workers import DaskWorkers, LocalWorkers, SchedulerError
 
@@ -59,7 +59,7 @@ def replay(
         raise click.UsageError("--export needs -o DIR, and goes neither with --set nor with --audit")
     try:
         for text in settings:
-            Setting.of(text)
+            ChangedSetting.of(text)
         places = found(recordings)
         if directory is not None:
             directory.mkdir(parents=True, exist_ok=True)

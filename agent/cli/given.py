@@ -17,7 +17,7 @@ from agent.recording.witness import PUBLIC_NAME, SUFFIX, HeadFile, WitnessError
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class GivenFiles:
     """Recordings to audit. `up_to`: for a whole directory, the highest file number; none up to it may be missing.
 
     `directory`: this directory. `heads`: heads that the recordings must reach. `faults`: what is
@@ -31,10 +31,10 @@ class Given:
     faults: list[str] = field(default_factory=list)
 
 
-def recordings_of(paths: Sequence[Path]) -> Given:
+def recordings_of(paths: Sequence[Path]) -> GivenFiles:
     """The given files, or all recordings of a single given directory. Raises StoreError."""
     if len(paths) != 1 or not paths[0].is_dir():
-        return Given(paths)
+        return GivenFiles(paths)
     files = recordings(paths[0])
     store, head = paths[0] / FILE_NAME, paths[0] / HEAD_NAME
     highest = files[-1][0] if files else 0
@@ -42,7 +42,7 @@ def recordings_of(paths: Sequence[Path]) -> Given:
         with History(store) as history:
             highest = max(highest, history.file_sequence())
     heads = [GivenHead(str(head), _begin_of(head), elsewhere=False)] if head.exists() else []
-    return Given([path for _, path in files], highest, paths[0], heads)
+    return GivenFiles([path for _, path in files], highest, paths[0], heads)
 
 
 def read_head(path: Path) -> GivenHead:
@@ -55,7 +55,7 @@ def read_head(path: Path) -> GivenHead:
     return GivenHead(str(path), data, elsewhere=True)
 
 
-def add_witnessed(given: Given, directory: Path) -> None:
+def add_witnessed(given: GivenFiles, directory: Path) -> None:
     """Add the newest head of each recording that a witness kept of the recordings' gateway; or what is wrong with them.
 
     Raises WitnessError where it kept none, KeyFileError, OSError.

@@ -20,8 +20,8 @@ from agent.config.reading import parse_config
 from agent.config.sinks import Recording, Zenoh
 from agent.keys.files import KeyPair, gateway_key
 from agent.setup import channel as tables
-from agent.setup.asking import Asking, Stated, driver_options
-from agent.setup.devices import TEXT_LINES, Chosen, Found, Role, complete, listen, tables_of
+from agent.setup.asking import Interview, SourcedValue, driver_options
+from agent.setup.devices import TEXT_LINES, ChosenDevice, ProbedDevice, Role, complete, listen, tables_of
 from agent.setup.known_filters import stated_filters
 from agent.setup.toml import written
 from agent.terminal.text import say
@@ -127,7 +127,7 @@ def init(config: Path, **given: Any) -> int:
     if config.exists():
         say(f"fieldcal init: {config}: the file exists; remove it, or choose another name", err=True)
         return 2
-    asking = Asking()
+    asking = Interview()
     devices = _devices(asking, given)
     listen(devices, asking)
     for device in devices:
@@ -147,7 +147,7 @@ def _signing_key(config: Path, answers: tables.Answers, given: Path | None) -> P
     return (given or config.parent / "keys" / name).absolute()
 
 
-def _text(path: Path, answers: tables.Answers, devices: list[Chosen]) -> str:
+def _text(path: Path, answers: tables.Answers, devices: list[ChosenDevice]) -> str:
     """The configuration."""
     today = f"{datetime.now(UTC):%Y-%m-%d}"
     return written(
@@ -161,7 +161,7 @@ def _text(path: Path, answers: tables.Answers, devices: list[Chosen]) -> str:
     )
 
 
-def _write(path: Path, answers: tables.Answers, devices: list[Chosen], key: Path | None) -> int:
+def _write(path: Path, answers: tables.Answers, devices: list[ChosenDevice], key: Path | None) -> int:
     """Check the configuration as `fieldcal check` does, and write it to a new file; make the key, unless it is None."""
     text = _text(path, answers, devices)
     try:
@@ -175,7 +175,7 @@ def _write(path: Path, answers: tables.Answers, devices: list[Chosen], key: Path
         with path.open("x", encoding="utf-8") as file:
             if key is not None:
                 pair = gateway_key(key)
-                text = _text(path, replace(answers, signing_key=Stated(str(key), "init")), devices)
+                text = _text(path, replace(answers, signing_key=SourcedValue(str(key), "init")), devices)
             file.write(text)
     except OSError as error:
         say(f"fieldcal init: {path}: {error.strerror}", err=True)
@@ -200,20 +200,22 @@ def _tell_key(pair: KeyPair) -> None:
     say(f"{pair.public}: give this public key to the auditor: fieldcal audit DATA --public-key {pair.public.name}")
 
 
-def _stated_driver(role: Role, given: dict[str, Any]) -> Stated[str]:
-    return Stated(given[role], f"option --{role}") if given[role] else Stated(TEXT_LINES, "default for a port")
+def _stated_driver(role: Role, given: dict[str, Any]) -> SourcedValue[str]:
+    return (
+        SourcedValue(given[role], f"option --{role}") if given[role] else SourcedValue(TEXT_LINES, "default for a port")
+    )
 
 
-def _stated_options(role: Role, given: dict[str, Any]) -> dict[str, Stated[Any]]:
+def _stated_options(role: Role, given: dict[str, Any]) -> dict[str, SourcedValue[Any]]:
     """The options of a device that are stated on the command line."""
     stated = driver_options(given[f"{role}_options"], f"--{role}-option")
-    options = {name: Stated(value, f"option --{role}-option") for name, value in stated.items()}
+    options = {name: SourcedValue(value, f"option --{role}-option") for name, value in stated.items()}
     if port := given[f"{role}_port"]:
-        options["port"] = Stated(lasting_name(port), f"option --{role}-port {port}")
+        options["port"] = SourcedValue(lasting_name(port), f"option --{role}-port {port}")
     return options
 
 
-def _devices(asking: Asking, given: dict[str, Any]) -> list[Chosen]:
+def _devices(asking: Interview, given: dict[str, Any]) -> list[ChosenDevice]:
     """The sensor, and the reference if there is one."""
     roles: list[Role] = ["sensor"] if given["no_reference"] or given["mount"] == "rests" else ["sensor", "reference"]
     open_roles = [role for role in roles if not given[role] and not given[f"{role}_port"]]
@@ -223,37 +225,37 @@ def _devices(asking: Asking, given: dict[str, Any]) -> list[Chosen]:
     for role in roles:
         options = _stated_options(role, given)
         if role not in open_roles:
-            chosen.append(Chosen(role, _stated_driver(role, given), options))
+            chosen.append(ChosenDevice(role, _stated_driver(role, given), options))
             continue
         candidates = [device for device in found if device.options.get("port") not in used]
         device = _pick(asking, role, candidates)
         if device is not None:
             found.remove(device)
             source = f"probe: {device.label}"
-            of_probe = {name: Stated(value, source) for name, value in device.options.items()}
-            chosen.append(Chosen(role, Stated(device.driver, source), of_probe | options))
+            of_probe = {name: SourcedValue(value, source) for name, value in device.options.items()}
+            chosen.append(ChosenDevice(role, SourcedValue(device.driver, source), of_probe | options))
     return chosen
 
 
-def _found() -> list[Found]:
+def _found() -> list[ProbedDevice]:
     """What the probe finds: chips on I2C, then serial ports of which the system knows something."""
     drivers = i2c_drivers()
     chips = [
-        Found(answer.drivers[0], {"bus": bus.number, "address": answer.address},
+        ProbedDevice(answer.drivers[0], {"bus": bus.number, "address": answer.address},
               f"{answer.identity} at 0x{answer.address:02X} on /dev/i2c-{bus.number}")
         for bus in (on_bus(number, drivers, self_test=False) for number in i2c_buses())
         for answer in bus.answers
         if answer.drivers
     ]  # fmt: skip
     ports = [
-        Found(TEXT_LINES, {"port": port["port"]}, f"{port['port']} ({port['description']})")
+        ProbedDevice(TEXT_LINES, {"port": port["port"]}, f"{port['port']} ({port['description']})")
         for port in serial_ports()
         if port["description"] not in ("", "n/a")
     ]
     return chips + ports
 
 
-def _pick(asking: Asking, role: Role, candidates: list[Found]) -> Found | None:
+def _pick(asking: Interview, role: Role, candidates: list[ProbedDevice]) -> ProbedDevice | None:
     """The device of this role among those that were found: the only one, or the answer of the user."""
     stating = f"state --{role} DRIVER, or --{role}-port PORT"
     if role == "reference":
@@ -273,21 +275,21 @@ def _pick(asking: Asking, role: Role, candidates: list[Found]) -> Found | None:
     return candidates[0]
 
 
-def _answers(asking: Asking, devices: list[Chosen], given: dict[str, Any]) -> tables.Answers:
+def _answers(asking: Interview, devices: list[ChosenDevice], given: dict[str, Any]) -> tables.Answers:
     sensor = devices[0]
     reference = devices[1] if len(devices) > 1 else None
     mount = _mount(given, reference)
-    theta: Stated[Any]
-    alphas: Stated[Any]
-    theta = alphas = Stated(None, "not used")
+    theta: SourcedValue[Any]
+    alphas: SourcedValue[Any]
+    theta = alphas = SourcedValue(None, "not used")
     if mount.value == "clamp":
         theta = asking.value("--theta-deg", given["theta_deg"], "inclination theta of the clamp, deg", kind=float)
         question = "turns alpha of the clamp, deg, with commas"
         alphas = asking.value("--alpha-deg", given["alpha_deg"], question, ALPHAS_DEG, kind=numbers)
 
-    def of(model: Any, name: str, option: str) -> Stated[Any]:
+    def of(model: Any, name: str, option: str) -> SourcedValue[Any]:
         value = given[option]
-        return Stated(value, f"option --{option.replace('_', '-')}") if value else _default(model, name)
+        return SourcedValue(value, f"option --{option.replace('_', '-')}") if value else _default(model, name)
 
     return tables.Answers(
         site=asking.value("--site", given["site"], "Name of the site", _default(Gateway, "site").value),
@@ -295,9 +297,9 @@ def _answers(asking: Asking, devices: list[Chosen], given: dict[str, Any]) -> ta
         mount=mount,
         theta_deg=theta,
         alpha_deg=alphas,
-        rotation=Stated(given["rotation"], "option --rotation")
+        rotation=SourcedValue(given["rotation"], "option --rotation")
         if given["rotation"]
-        else Stated(tables.IDENTITY, "init"),
+        else SourcedValue(tables.IDENTITY, "init"),
         gravity_mps2=of(Channel, "gravity_mps2", "gravity"),
         sensitivity=_sensitivity(asking, sensor, given["sensitivity"]),
         u_main_pct=of(Prior, "u_main_pct", "u_sensitivity_pct"),
@@ -311,22 +313,22 @@ def _answers(asking: Asking, devices: list[Chosen], given: dict[str, Any]) -> ta
     )
 
 
-def _default(model: Any, name: str) -> Stated[Any]:
-    return Stated(model.model_fields[name].default, "default")
+def _default(model: Any, name: str) -> SourcedValue[Any]:
+    return SourcedValue(model.model_fields[name].default, "default")
 
 
-def _mount(given: dict[str, Any], reference: Chosen | None) -> Stated[tables.Mount]:
+def _mount(given: dict[str, Any], reference: ChosenDevice | None) -> SourcedValue[tables.Mount]:
     """How the sensor stands: as stated, or by the axes of the reference."""
     if given["mount"]:
-        return Stated(given["mount"], "option --mount")
+        return SourcedValue(given["mount"], "option --mount")
     if reference is None:
-        return Stated("rests", "option --no-reference")
+        return SourcedValue("rests", "option --no-reference")
     if given["rotation"] or (_axes(reference) == 3 and given["theta_deg"] is None):
-        return Stated("beside", "the reference has three axes")
-    return Stated("clamp", "the reference has one axis")
+        return SourcedValue("beside", "the reference has three axes")
+    return SourcedValue("clamp", "the reference has one axis")
 
 
-def _axes(device: Chosen) -> int:
+def _axes(device: ChosenDevice) -> int:
     """Number of axes: as an option states it; otherwise 3 of a chip or of another device with all its axes."""
     if (axes := device.value("axes")) is not None:
         return int(axes)
@@ -337,20 +339,20 @@ def _axes(device: Chosen) -> int:
     return 3 if chip or device.driver.value in ("epson", "iio", "mip", "witmotion") else 1
 
 
-def _sensitivity(asking: Asking, sensor: Chosen, given: float | None) -> Stated[Any]:
+def _sensitivity(asking: Interview, sensor: ChosenDevice, given: float | None) -> SourcedValue[Any]:
     """The sensor's nominal sensitivity; None where its driver knows it."""
     if given is not None:
-        return Stated(given, "option --sensitivity")
+        return SourcedValue(given, "option --sensitivity")
     options = _options(sensor)
     if options is None:
-        return Stated(None, "missing")  # the check of the whole configuration names the fault
+        return SourcedValue(None, "missing")  # the check of the whole configuration names the fault
     if options.tells_sensitivity:
-        return Stated(None, "the driver knows it")
+        return SourcedValue(None, "the driver knows it")
     question = f"nominal sensitivity of the sensor, {sensor.value('unit') or 'output unit'} per m/s2, of its data sheet"
     return asking.value("--sensitivity", None, question + sensor.hint, kind=float)
 
 
-def _options(device: Chosen) -> Options | None:
+def _options(device: ChosenDevice) -> Options | None:
     """The options of a device as its driver takes them; None where it refuses them."""
     model = load_driver(device.driver.value).options_model
     try:
@@ -359,22 +361,22 @@ def _options(device: Chosen) -> Options | None:
         return None
 
 
-def _reference_sensitivity(asking: Asking, given: float | None, reference: Chosen | None) -> Stated[Any]:
+def _reference_sensitivity(asking: Interview, given: float | None, reference: ChosenDevice | None) -> SourcedValue[Any]:
     """Indication of the reference per SI unit: as stated, or as its unit says."""
     if given is not None:
-        return Stated(given, "option --reference-sensitivity")
+        return SourcedValue(given, "option --reference-sensitivity")
     if reference is not None and (known := nominal_sensitivity(reference.value("unit"))) is not None:
-        return Stated(known, "the unit of the reference is g")
+        return SourcedValue(known, "the unit of the reference is g")
     options = None if reference is None else _options(reference)
     if options is not None and (asked := options.asked_of_certificate):
         return asking.value("--reference-sensitivity", None, f"sensitivity of the reference: {asked}", kind=float)
     return _default(Certificate, "sensitivity")
 
 
-def _quantity(given: str | None, reference: Chosen | None) -> Stated[str]:
+def _quantity(given: str | None, reference: ChosenDevice | None) -> SourcedValue[str]:
     if given:
-        return Stated(given, "option --reference-quantity")
+        return SourcedValue(given, "option --reference-quantity")
     if reference is not None and reference.value("unit") == "m/s":
-        return Stated("velocity", "unit of the reference")
+        return SourcedValue("velocity", "unit of the reference")
     known = "" if reference is None or (options := _options(reference)) is None else options.quantity
-    return Stated(known, "the channels of the reference") if known else _default(Certificate, "quantity")
+    return SourcedValue(known, "the channels of the reference") if known else _default(Certificate, "quantity")

@@ -50,10 +50,10 @@ def parsed(arguments: list[str]) -> dict[str, Any]:
 
 def check_stated(path: Path) -> None:
     """Raises ConfigError before the session rather than after it."""
-    from agent.certificate.statements import Statements
+    from agent.certificate.statements import CertificateStatements
     from agent.config.reading import load_model
 
-    load_model(path, Statements)
+    load_model(path, CertificateStatements)
 
 
 def made(options: dict[str, Any], output: Path, stated: Path | None) -> int:

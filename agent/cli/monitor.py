@@ -93,7 +93,7 @@ def monitor(
     """Show all sensors of all gateways on one web page, until Ctrl-C. Exit status: 1 port or disk, 2 bad input."""
     try:
         from agent.monitor.engines import DatabaseError
-        from agent.monitor.running import Bus, Web, serve
+        from agent.monitor.running import BusAccess, Web, serve
         from agent.monitor.settings import MonitorSettings, load_settings
         from agent.monitor.users import UsersError
     except ImportError:
@@ -103,7 +103,7 @@ def monitor(
         return _add_user(users, add_user, verbs)
     host, port = _listen(listen)
     _check_https(host, users, https_certificate, https_key, behind_proxy)
-    bus = Bus(
+    bus = BusAccess(
         endpoints=endpoints, tls=tls_files(endpoints, ca, certificate, certificate_key), keys=keys,
         commander=tls_files(endpoints, ca, command_certificate or certificate, command_key or certificate_key),
     )  # fmt: skip

@@ -26,7 +26,7 @@ MICRO = 1e6
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ProbedAddress:
     """Answer at an address.
 
     `drivers` are those that recognise the device (several if the part does not tell which of them it is); `note` is
@@ -44,12 +44,12 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class Bus:
+class ProbedBus:
     """The bus /dev/i2c-N; `fault` tells why it cannot be probed."""
 
     number: int
     fault: str
-    answers: list[Answer]
+    answers: list[ProbedAddress]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ def probe(buses: tuple[str | int, ...], driver: str | None, self_test: bool, jso
     return _status(found, selected, named=bool(buses))
 
 
-def _status(buses: Sequence[Bus], selected: Sequence[Selected], *, named: bool) -> int:
+def _status(buses: Sequence[ProbedBus], selected: Sequence[Selected], *, named: bool) -> int:
     """The exit status; `named`: these buses were asked for by their names."""
     if named and (any(bus.fault for bus in buses) or not all(one.identity for one in selected)):
         return 1
@@ -135,13 +135,13 @@ def i2c_drivers() -> dict[str, type[FifoSensor]]:
     return found
 
 
-def on_bus(number: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Bus:
+def on_bus(number: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> ProbedBus:
     """Probe the addresses that the drivers know, in ascending order of the addresses."""
     adapter = I2CDevice("adapter", number, 0, time.sleep)
     try:
         adapter.open()
     except DeviceError as error:
-        return Bus(number, str(error), [])
+        return ProbedBus(number, str(error), [])
     finally:
         adapter.close()
     by_address: dict[int, dict[str, type[FifoSensor]]] = {}
@@ -152,10 +152,10 @@ def on_bus(number: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -
     answers = [answer for answer in tried if answer is not None]
     if len(answers) == 1:
         answers = [replace(answers[0], warning="")]
-    return Bus(number, "", answers)
+    return ProbedBus(number, "", answers)
 
 
-def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Answer | None:
+def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test: bool) -> ProbedAddress | None:
     known: dict[str, FifoSensor] = {}
     identities: list[str] = []
     notes: list[str] = []
@@ -167,15 +167,15 @@ def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test:
         except IdentityError as error:
             notes.append(str(error))
         except ConfigurationError as error:
-            return Answer(address, note=str(error))
+            return ProbedAddress(address, note=str(error))
         except DeviceLost:
             return None
     if not known:
-        return Answer(address, note="; ".join(notes))
+        return ProbedAddress(address, note="; ".join(notes))
     sensor = next(iter(known.values()))
     result = tested(sensor) if self_test else None
     told = {"used_by": sensor.used_by(), "warning": sensor.must_be_alone}
-    return Answer(address, list(known), " or ".join(identities), **told, self_test=result)
+    return ProbedAddress(address, list(known), " or ".join(identities), **told, self_test=result)
 
 
 def on_spi(bus: str, drivers: dict[str, type[FifoSensor]], self_test: bool) -> Selected:
@@ -225,7 +225,7 @@ def as_object(report: SelfTestReport) -> dict[str, Any]:
     }
 
 
-def _print_bus(bus: Bus) -> None:
+def _print_bus(bus: ProbedBus) -> None:
     if bus.fault:
         say(bus.fault)
         return
@@ -241,7 +241,7 @@ def _print_bus(bus: Bus) -> None:
             say(f"        {line}")
 
 
-def _print(buses: list[Bus], selected: list[Selected], ports: list[dict[str, str]], *, named: bool) -> None:
+def _print(buses: list[ProbedBus], selected: list[Selected], ports: list[dict[str, str]], *, named: bool) -> None:
     if not buses and not named:
         say("no I2C bus (no /dev/i2c-N): enable the adapter and load the kernel module i2c-dev")
     for bus in buses:

@@ -16,7 +16,7 @@ import click
 
 from agent.cli.loading import loading
 from agent.cli.rules import check_rules
-from agent.cli.stopping import TOLD, Run, StoppedAtStart, stopped_by_signals
+from agent.cli.stopping import TOLD, StoppableRun, StoppedAtStart, stopped_by_signals
 from agent.config import Config, ConfigError, load_config, parse_config
 from agent.config.key_file import KeyFileError
 from agent.delivery.history import StoreError
@@ -73,7 +73,7 @@ def run(
     with loading():
         from agent.acquisition.service import Service
         from agent.supervision.logs import log_as_json, under_journal
-        from agent.terminal.watch import Watch
+        from agent.terminal.watch import RunView
     try:
         with ExitStack() as stack:
             journal = log is None and under_journal(os.environ, sys.stderr.fileno())
@@ -89,7 +89,7 @@ def run(
             if with_router:
                 said.append(stack.enter_context(router(LOOPBACK, stopping)))
             title = f"virtual bench, {preset}" if truth else str(config)
-            watch = stack.enter_context(Watch(settings, title, truth, lines=not as_json))
+            watch = stack.enter_context(RunView(settings, title, truth, lines=not as_json))
             for line in (*said, *signing_key_warnings(settings, data_dir), *_shortcomings(settings)):
                 watch.say(line)
             stopping.service = Service(settings, data_dir, watch)
@@ -207,7 +207,7 @@ def virtual_bench(
 
 
 @contextmanager
-def router(endpoint: str, run: Run) -> Iterator[str]:
+def router(endpoint: str, run: StoppableRun) -> Iterator[str]:
     """Use the router that runs at `endpoint`, or start one as a child of the run; yields a line for the user."""
     from agent.delivery.router import router_running
 

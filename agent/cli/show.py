@@ -16,7 +16,7 @@ from agent import __version__
 from agent.cli.rules import check_rules
 from agent.core.events import RESULTS, CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.calibrations import calibrations
-from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.terminal.quantity import counted, size
 from agent.terminal.text import one_line, say
 
@@ -213,16 +213,16 @@ def _keys(public_key: Path | None) -> KnownKeys | None:
 class SensorHistory:
     """Results of one sensor. Lists begin with the newest; each calibration is in them once."""
 
-    status: Record | None
-    calibration: Record | None  # in force
-    calibrations: list[Record]
-    windows: list[Record]
-    drift: list[Record]  # verdicts of the drift test
-    routine: dict[str, list[Record]]  # results that come by schedule; key: their kind
+    status: StoredResult | None
+    calibration: StoredResult | None  # in force
+    calibrations: list[StoredResult]
+    windows: list[StoredResult]
+    drift: list[StoredResult]  # verdicts of the drift test
+    routine: dict[str, list[StoredResult]]  # results that come by schedule; key: their kind
     budget: Sources | str  # of the calibration in force; why it is not known
 
     @property
-    def records(self) -> list[Record]:
+    def records(self) -> list[StoredResult]:
         """All of them."""
         single = [record for record in (self.status, self.calibration) if record is not None]
         listed = [*self.calibrations, *self.windows, *self.drift]
@@ -370,7 +370,7 @@ def _print_calibration(console: TextConsole, calibration: CalibrationUpdate, bud
         console.print_line(f"  {line}")
 
 
-def _budget(in_force: Record | None, memories: Sequence[Memory]) -> Sources | str:
+def _budget(in_force: StoredResult | None, memories: Sequence[Memory]) -> Sources | str:
     from agent.core.past import PastError, budget_in_force
 
     if in_force is None or not isinstance(update := in_force.result, CalibrationUpdate):

@@ -16,7 +16,7 @@ import click
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
-    from agent.fleet.simulated import Stop
+    from agent.fleet.simulated import StopEvent
     from agent.fleet.simulated_processes import FleetProcesses
 
 FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; measured in docs/fleet-evidence.md
@@ -103,7 +103,7 @@ def _say_odd(simulated: FleetProcesses) -> None:
         say(f"{behaviour}: {', '.join(names[:NAMES_SHOWN]) or 'none'}{more}")
 
 
-def _step_of(simulated: FleetProcesses, stop: Stop, truth: Path | None, seed: int) -> Callable[[int], int]:
+def _step_of(simulated: FleetProcesses, stop: StopEvent, truth: Path | None, seed: int) -> Callable[[int], int]:
     """One round of all gateways, after which `truth` is written; it gives the number of results.
 
     It raises BrokenProcessPool where a process has ended though it was not to stop.
@@ -132,7 +132,7 @@ def _write_truth(path: Path, truth: dict[str, Any]) -> None:
 
 
 def _run(
-    step: Callable[[int], int], stop: Stop, every_s: float, speed: float, age_days: float,
+    step: Callable[[int], int], stop: StopEvent, every_s: float, speed: float, age_days: float,
     duration_s: float | None,
 ) -> int:  # fmt: skip
     """Step until it is to stop; returns the number of results."""
@@ -158,7 +158,7 @@ def _files_fault(gateways: int) -> str:
     return ""
 
 
-def _router_fault(endpoint: str, stop: Stop) -> str:
+def _router_fault(endpoint: str, stop: StopEvent) -> str:
     """Wait for the router; why there is none, "" if there is one. Raises EndpointError."""
     from agent.delivery.router import router_running
 

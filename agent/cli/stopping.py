@@ -48,7 +48,7 @@ def _end_at_once(*_: Any) -> None:
     os._exit(0)
 
 
-class Run:
+class StoppableRun:
     """What a signal does to a run: it stops the `service` that has begun, and otherwise raises StoppedAtStart once.
 
     `children`: processes that must not outlive this one.
@@ -80,12 +80,12 @@ class Run:
 
 
 @contextmanager
-def stopped_by_signals() -> Iterator[Run]:
+def stopped_by_signals() -> Iterator[StoppableRun]:
     """Within this context a signal stops the run, by StoppedAtStart while it starts. After it signals are ignored.
 
     If even that does not end the start within LONGEST_S, the process ends with status 0.
     """
-    run, ended = Run(), threading.Event()
+    run, ended = StoppableRun(), threading.Event()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
 

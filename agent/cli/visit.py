@@ -142,10 +142,10 @@ def _visit(
     from agent.bench.capture import Capture
     from agent.bench.kinds import mounted, stated, write_prior
     from agent.bench.measuring import Measuring
-    from agent.bench.visit_dialogue import LEAST_STAY_S, Stay, VisitDialogue, forbidden
+    from agent.bench.visit_dialogue import LEAST_STAY_S, VisitDialogue, VisitStay, forbidden
     from agent.bench.visiting import Visiting
     from agent.calibrate.stated import options_of
-    from calib.visit.next_stop import COVERAGE_FACTOR, Wanted
+    from calib.visit.next_stop import COVERAGE_FACTOR, WantedUncertainty
 
     assert channel.reference is not None
     output = options["data_dir"] / channel.sensor
@@ -158,12 +158,12 @@ def _visit(
         arguments = [*stated(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
         measuring = Measuring(channel, options_of(parsed(arguments)))
         across = options["u_transverse_pct"]
-        wanted = Wanted(options["u_pct"] / 100.0, np.inf if across is None else across / 100.0)
+        wanted = WantedUncertainty(options["u_pct"] / 100.0, np.inf if across is None else across / 100.0)
         if why := forbidden(COVERAGE_FACTOR * measuring.priors.reference, wanted.main):
             tell(f"  {why}")
         stay_s = 60.0 * options["minutes"]
         dialogue = VisitDialogue(
-            Visiting(measuring, wanted, aside), capture, Stay(min(LEAST_STAY_S, stay_s), stay_s),
+            Visiting(measuring, wanted, aside), capture, VisitStay(min(LEAST_STAY_S, stay_s), stay_s),
             _assent() if options["yes"] else partial(ask, err=options["apart"]), tell, progress,
             None if clamp is None else partial(clamp, channel.sensor),
         )  # fmt: skip

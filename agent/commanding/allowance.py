@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-class Allowance:
+class RateLimit:
     """Lets `burst` items pass at once, then `rate_hz` per second. The caller gives the time; it must not decrease."""
 
     def __init__(self, burst: int, rate_hz: float) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
-from agent.commanding.allowance import Allowance
+from agent.commanding.allowance import RateLimit
 from agent.commanding.arguments import VERBS, Accept, Arguments, Rollback, parse_arguments
 from agent.commanding.counters import Counters
 from agent.commanding.envelope import Order, parse_envelope
@@ -22,7 +22,7 @@ from agent.config.key_file import KeyFileError
 from agent.config.known_keys import WatchedKeys
 from agent.core.events import Command
 from agent.delivery.keys import CHUNK
-from agent.delivery.record import Record
+from agent.delivery.record import StoredResult
 from agent.delivery.schema import StoreError
 
 # s by which a gateway's clock may be off: with NTP it is right within a second, but not soon after a start.
@@ -35,7 +35,7 @@ RECORDED_REFUSALS = (20, 0.1)
 TAKEN = (20, 1.0)
 LONGEST_REASON = 300  # characters
 
-Find = Callable[[str, str, int], Record | None]
+Find = Callable[[str, str, int], StoredResult | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +78,8 @@ class CommandDesk:
         self._put = put
         self.counters = Counters(data_dir)
         self._mutex = threading.Lock()
-        self._taken = Allowance(*TAKEN)
-        self._recorded = Allowance(*RECORDED_REFUSALS)
+        self._taken = RateLimit(*TAKEN)
+        self._recorded = RateLimit(*RECORDED_REFUSALS)
         self._unrecorded = 0
         self._counts: Counter[str] = Counter()
         self._closed = False

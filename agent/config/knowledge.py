@@ -262,7 +262,7 @@ class Temperature(Section):
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class StatedFields:
     """The fields of a channel that state one number, as "section.field"; the root of the sum of their squares counts.
     `convert` converts their unit to that of the estimators."""
 
@@ -279,37 +279,39 @@ def _percent_a_year(walked_pct: float) -> float:
     return float(from_percent(walked_pct) / np.sqrt(YEAR_DAYS))
 
 
-_ANGLE, _TILT = Setting(("uncertainty.angle_deg",), from_deg), Setting(("uncertainty.tilt_deg",), from_deg)
+_ANGLE, _TILT = StatedFields(("uncertainty.angle_deg",), from_deg), StatedFields(("uncertainty.tilt_deg",), from_deg)
 # By the names of calib.estimate.nuisances.Priors.
-PRIORS: Mapping[str, Setting] = {
-    "sensor_corner_hz": Setting(("prior.u_corner_hz",)), "sensor_corner_at_hz": Setting(("prior.corner_hz",)),
-    "lag_s": Setting(("uncertainty.lag_s", "certificate.u_lag_s")), "lag_at_s": Setting(("certificate.lag_s",), neg),
-    "theta_rad": Setting(("uncertainty.theta_deg",), from_deg),
-    "theta_position_rad": Setting(("uncertainty.theta_position_deg",), from_deg),
-    "alpha_common_rad": Setting(("uncertainty.alpha_common_deg",), from_deg),
+PRIORS: Mapping[str, StatedFields] = {
+    "sensor_corner_hz": StatedFields(("prior.u_corner_hz",)), "sensor_corner_at_hz": StatedFields(("prior.corner_hz",)),
+    "lag_s": StatedFields(("uncertainty.lag_s", "certificate.u_lag_s")),
+    "lag_at_s": StatedFields(("certificate.lag_s",), neg),
+    "theta_rad": StatedFields(("uncertainty.theta_deg",), from_deg),
+    "theta_position_rad": StatedFields(("uncertainty.theta_position_deg",), from_deg),
+    "alpha_common_rad": StatedFields(("uncertainty.alpha_common_deg",), from_deg),
     "angle_rad": _ANGLE, "gravity_direction_rad": _ANGLE,
-    "offset_position_mps2": Setting(("uncertainty.offset_position_mps2",)),
-    "gravity_mps2": Setting(("uncertainty.gravity_mps2",)),
-    "reference": Setting(("certificate.u_sensitivity_pct",), from_percent),
-    "reference_transverse": Setting(("certificate.u_transverse_pct",), from_percent),
-    "reference_drift": Setting(("certificate.stability_pct",), from_percent),
-    "reference_per_k": Setting(("certificate.u_sensitivity_pct_per_k",), from_percent),
-    "reference_corner_hz": Setting(("certificate.u_corner_hz",)),
-    "reference_corner_at_hz": Setting(("certificate.corner_hz",)),
-    "rotation_rad": Setting(("uncertainty.rotation_deg",), from_deg),
-    "transverse": Setting(("uncertainty.transverse_motion_pct",), from_percent),
-    "offset_mps2": Setting(("uncertainty.offset_mps2",)), "lag_window_s": Setting(("uncertainty.lag_window_s",)),
-    "reference_frequency_hz": Setting(("prior.reference_frequency_hz",)),
+    "offset_position_mps2": StatedFields(("uncertainty.offset_position_mps2",)),
+    "gravity_mps2": StatedFields(("uncertainty.gravity_mps2",)),
+    "reference": StatedFields(("certificate.u_sensitivity_pct",), from_percent),
+    "reference_transverse": StatedFields(("certificate.u_transverse_pct",), from_percent),
+    "reference_drift": StatedFields(("certificate.stability_pct",), from_percent),
+    "reference_per_k": StatedFields(("certificate.u_sensitivity_pct_per_k",), from_percent),
+    "reference_corner_hz": StatedFields(("certificate.u_corner_hz",)),
+    "reference_corner_at_hz": StatedFields(("certificate.corner_hz",)),
+    "rotation_rad": StatedFields(("uncertainty.rotation_deg",), from_deg),
+    "transverse": StatedFields(("uncertainty.transverse_motion_pct",), from_percent),
+    "offset_mps2": StatedFields(("uncertainty.offset_mps2",)),
+    "lag_window_s": StatedFields(("uncertainty.lag_window_s",)),
+    "reference_frequency_hz": StatedFields(("prior.reference_frequency_hz",)),
 }  # fmt: skip
-AT_FIXED_MOUNT: Mapping[str, Setting] = {**PRIORS, "gravity_direction_rad": _TILT, "lean_rad": _TILT}
+AT_FIXED_MOUNT: Mapping[str, StatedFields] = {**PRIORS, "gravity_direction_rad": _TILT, "lean_rad": _TILT}
 # By the names of calib.estimate.wander.Wander.
-WALKS: Mapping[str, Setting] = {
-    "sensitivity": Setting(("process.sensitivity_pct",), from_percent),
-    "tilt_rad": Setting(("process.tilt_deg",), from_deg),
-    "offset_mps2": Setting(("process.offset_mps2",)),
-    "offset_rate_mps2": Setting(("process.offset_rate_mps2",)),
-    "offset_rate_walk_mps2": Setting(("process.offset_rate_walk_mps2",)),
-    "reference_drift": Setting(("certificate.stability_pct",), _percent_a_year),
+WALKS: Mapping[str, StatedFields] = {
+    "sensitivity": StatedFields(("process.sensitivity_pct",), from_percent),
+    "tilt_rad": StatedFields(("process.tilt_deg",), from_deg),
+    "offset_mps2": StatedFields(("process.offset_mps2",)),
+    "offset_rate_mps2": StatedFields(("process.offset_rate_mps2",)),
+    "offset_rate_walk_mps2": StatedFields(("process.offset_rate_walk_mps2",)),
+    "reference_drift": StatedFields(("certificate.stability_pct",), _percent_a_year),
 }
 
 
@@ -360,7 +362,7 @@ class Knowledge(Section):
         """How fast things may change."""
         return Wander(self._stated(WALKS))
 
-    def _stated(self, settings: Mapping[str, Setting]) -> dict[str, float]:
+    def _stated(self, settings: Mapping[str, StatedFields]) -> dict[str, float]:
         return {name: setting.convert(setting.of(self)) for name, setting in settings.items()}
 
     def temperature_model(self) -> TemperatureModel:

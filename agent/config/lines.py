@@ -27,7 +27,7 @@ def lines_of(text: str, wanted: Collection[Path]) -> dict[Path, int]:
 
     `text` must be TOML that tomllib reads.
     """
-    scan = _Scan({path[:length] for path in wanted for length in range(len(path) + 1)})
+    scan = _TokenScan({path[:length] for path in wanted for length in range(len(path) + 1)})
     for token in _TOKEN.finditer(text):
         scan.take(str(token.lastgroup), token[0])
     return {
@@ -35,7 +35,7 @@ def lines_of(text: str, wanted: Collection[Path]) -> dict[Path, int]:
     }
 
 
-class _Scan:
+class _TokenScan:
     """Reads token by token. Knows which kind comes next, and the table, lists and inline tables around it."""
 
     def __init__(self, wanted: Collection[Path]) -> None:

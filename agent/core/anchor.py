@@ -19,7 +19,7 @@ TRANSVERSE = ~MAIN & ~OFFSET
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class AnchorDistance:
     """How far a calibration is from the anchor. `reason` names every limit that is exceeded; it is "" if none is."""
 
     reason: str
@@ -55,11 +55,11 @@ class Anchor:
         """(12,) True where the anchor is known to within max_change. False for an offset that has no limit."""
         return self._fixed & np.isfinite(self._max_change())
 
-    def change(self, calibration: Calibration) -> Change:
+    def change(self, calibration: Calibration) -> AnchorDistance:
         """Compare the change from the anchor to this calibration with the limits."""
         value = _values(calibration)
         if not np.isfinite(value).all():
-            return Change("S or Q is not finite", {})
+            return AnchorDistance("S or Q is not finite", {})
         moved, limits = np.abs(value - self._value), self.limits()
         numbers, reasons = dict[str, float](), list[str]()
         unit = np.where(MAIN, np.abs(self._value) / 100, np.where(TRANSVERSE, self._full_scale() / 100, 1.0))
@@ -71,7 +71,9 @@ class Anchor:
             reasons += [PARAMETERS[p] for p in np.flatnonzero(kind & ~(moved <= limits))]
         self._turned(calibration, numbers, reasons)
         self._off_sheet(value, numbers, reasons)
-        return Change(f"S or Q changed by more than max_change: {', '.join(reasons)}" if reasons else "", numbers)
+        return AnchorDistance(
+            f"S or Q changed by more than max_change: {', '.join(reasons)}" if reasons else "", numbers
+        )
 
     def refusal(self, calibration: Calibration) -> str:
         """Why a calibration must not be proposed to an operator: it is not usable, an output is dead, or axes are

@@ -20,7 +20,7 @@ from agent.core.kept import keep, kept_as, plain, restated, shelved, take_up, up
 from agent.core.mean_watch import MeanWatch
 from agent.core.operators import CommandError, answer, commanded_pose
 from agent.core.outcome import (
-    Source,
+    ResultSource,
     again,
     calibration_update,
     drift_report,
@@ -31,8 +31,8 @@ from agent.core.outcome import (
 )
 from agent.core.references import References
 from agent.core.run_time import RunTime
-from agent.core.streams import Streams, Verdict
-from agent.core.watch import Hour, Watch
+from agent.core.streams import JudgedWindow, Streams
+from agent.core.watch import Hour, SensorWatch
 from agent.core.watched import (
     DAY_NS,
     NOT_CALIBRATED,
@@ -73,7 +73,7 @@ class ChannelState:
         self._status = ""  # no status was published yet
         self._refused = 0  # how many windows in a row were refused
         self._clocks, self._time = Clocks(), RunTime()
-        self._watched, self._means = (Watch() if channel.watched else None), MeanWatch()
+        self._watched, self._means = (SensorWatch() if channel.watched else None), MeanWatch()
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
         """Begin a new run. Seconds count from `origin_ns`. `kept`: a state (`memory`) for each identity of a sensor."""
@@ -151,8 +151,8 @@ class ChannelState:
 
     # --- time and identity
 
-    def _source(self) -> Source:
-        return Source(self.sensor, self.identity, self._unit, self._time.utc_ns)
+    def _source(self) -> ResultSource:
+        return ResultSource(self.sensor, self.identity, self._unit, self._time.utc_ns)
 
     def _identify(self, info_json: str) -> list[Result]:
         info, identity = json.loads(info_json), identity_of(info_json)
@@ -162,7 +162,7 @@ class ChannelState:
             if self._estimation is not None:
                 self._kept = shelved(self._kept, self.identity, self.memory())
                 self._streams.forget_sensor()
-                self._watched, self._means = (None if self._watched is None else Watch()), MeanWatch()
+                self._watched, self._means = (None if self._watched is None else SensorWatch()), MeanWatch()
                 belongs, self._estimation = "", None
                 reason = f"{self.sensor} is another device now: {identity} instead of {self.identity}"
             known_as = kept_as(self._kept, identity, device_of(info))
@@ -279,7 +279,7 @@ class ChannelState:
         if fault or self._refused == REFUSED_IN_A_ROW:
             yield self._told(f"S and Q are not updated: {reason}")
 
-    def _results(self, verdict: Verdict) -> Iterator[Result]:
+    def _results(self, verdict: JudgedWindow) -> Iterator[Result]:
         window, judged, source = verdict.window, verdict.judged, self._source()
         if judged is None or self._estimation is None:
             yield from self._refuse(window, window.reason or f"{self.sensor} has not been connected in this run")

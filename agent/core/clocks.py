@@ -9,7 +9,7 @@ import numpy as np
 
 from agent.core.estimation import Estimation
 from agent.core.events import ClockReport, Result
-from agent.core.outcome import Source
+from agent.core.outcome import ResultSource
 from agent.core.stream import DeviceStream
 from calib.model import Array
 from calib.signal.order_statistics import median
@@ -30,7 +30,7 @@ class Clocks:
         self._due_s: float | None = EVERY_S
 
     def reports(
-        self, source: Source, now_s: float, streams: Mapping[str, DeviceStream], estimation: Estimation | None
+        self, source: ResultSource, now_s: float, streams: Mapping[str, DeviceStream], estimation: Estimation | None
     ) -> list[Result]:
         """At the first event of each minute since the run's origin: a report of each device that sent data
         since the last report.
@@ -70,7 +70,12 @@ def _lag(estimation: Estimation | None) -> tuple[float, float]:
 
 
 def _report(
-    source: Source, device: str, nominal_rate_hz: float, clock: ClockFit, lateness_s: Array, lag_s: tuple[float, float]
+    source: ResultSource,
+    device: str,
+    nominal_rate_hz: float,
+    clock: ClockFit,
+    lateness_s: Array,
+    lag_s: tuple[float, float],
 ) -> ClockReport:
     """`lateness_s` (B,) of the bursts behind the clock; `lag_s` is the value and its standard uncertainty."""
     offset_s = float(median(lateness_s))

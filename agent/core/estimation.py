@@ -18,7 +18,7 @@ from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
 from agent.core.hypotheses import Devices, confirmed, possible_jump, rescaled, shape_of_change, tilt_rad
 from agent.core.noise_watch import NoiseWatch
 from agent.core.time_shift import Anew, LagWatch
-from agent.core.windows import Found
+from agent.core.windows import StretchWindows
 from calib.drift.drift import DriftTest, DriftVerdict
 from calib.estimate.axes import LEAST_S, where_nothing_moved
 from calib.estimate.correction import Law
@@ -80,7 +80,7 @@ class Proposal:
 
 
 @dataclass(frozen=True, eq=False)
-class Tried:
+class TrialWindow:
     """A window tried on the state: what it says; `after` is the state that has taken it."""
 
     window_sums: WindowSums
@@ -118,7 +118,7 @@ class Estimation:
         self._held: list[Record] = []
         self._proposed: list[Proposal] = []
         self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
-        self._tried: Tried | None = None  # the newest window, for what is asked of it next
+        self._tried: TrialWindow | None = None  # the newest window, for what is asked of it next
         self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
         self._exchanged = False  # held windows show exchanged or rescaled outputs, and this was told
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
@@ -175,7 +175,7 @@ class Estimation:
             _, trial = trial.with_window(self._record(window, day, lag_s, temperature_degc))
         return trial
 
-    def contradicted(self, found: Found, day: float, lag_s: float) -> bool:
+    def contradicted(self, found: StretchWindows, day: float, lag_s: float) -> bool:
         """Whether a window, made with `lag_s` taken out, contradicts the state, or does not follow the reference."""
         for window in found.windows:
             if not window.used:
@@ -201,7 +201,7 @@ class Estimation:
                 self.gate.dismiss()  # windows held before were made with another lag
                 self._held = []
             record = self._record(window, day, lag_s, temperature_degc)
-            tried = Tried(window.sums, record, *self.state.tried(record, at_its_lag=True))
+            tried = TrialWindow(window.sums, record, *self.state.tried(record, at_its_lag=True))
         self._tried = None
         record, innovation, trial = tried.record, tried.innovation, tried.after
         noise_news = self.noise.update(record, self.state.scale)
@@ -318,12 +318,12 @@ class Estimation:
                 return self.gate.number_of(made.calibration)
         return None
 
-    def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Tried:
+    def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> TrialWindow:
         """The window tried on the state; the newest one is not tried again."""
         tried = self._tried
         if tried is None or tried.window_sums is not window.sums or tried.record.lag_s != lag_s:
             record = self._record(window, day, lag_s, temperature_degc)
-            self._tried = tried = Tried(window.sums, record, *self.state.tried(record))
+            self._tried = tried = TrialWindow(window.sums, record, *self.state.tried(record))
         return tried
 
     def shares_of(self, calibration: Calibration) -> Sequence[ReferenceShare]:

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from agent.config import Channel
-from agent.config.knowledge import AT_FIXED_MOUNT, PRIORS, Setting
+from agent.config.knowledge import AT_FIXED_MOUNT, PRIORS, StatedFields
 from agent.core.gate import Gate, Limit
 from agent.core.hypotheses import AN_UNKNOWN, DECISIVE
 from calib.estimate.innovation import Innovation
@@ -201,7 +201,7 @@ def _may_be(channel: Channel, setting: str, value: float) -> bool:
     return True
 
 
-def _setting(kind: Kind, fixed_mount: bool) -> Setting | None:
+def _setting(kind: Kind, fixed_mount: bool) -> StatedFields | None:
     """Where the configuration states the kind's uncertainty; None where it does not."""
     return None if kind.prior is None else (AT_FIXED_MOUNT if fixed_mount else PRIORS).get(kind.prior.name)
 

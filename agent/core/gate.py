@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config.gate import GateSettings
-from agent.core.anchor import COVERAGE_FACTOR, MAIN, Anchor, Change
+from agent.core.anchor import COVERAGE_FACTOR, MAIN, Anchor, AnchorDistance
 from calib.distributions import chi2_quantile
 from calib.estimate.axes import LEAST_S, unusable
 from calib.model import PARAMETERS, Calibration
@@ -64,7 +64,7 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class CommandEffect:
     """Effect of a command. `refused` says why it had none. `calibration` is in force now; None if nothing changed."""
 
     status: Status
@@ -194,7 +194,7 @@ class Gate:
             numbers | change.numbers,
         )
 
-    def _beyond(self, calibration: Calibration, change: Change, numbers: dict[str, float]) -> Decision:
+    def _beyond(self, calibration: Calibration, change: AnchorDistance, numbers: dict[str, float]) -> Decision:
         if wrong := self.refusal(calibration):
             return self._decision("hold", f"{change.reason}; {wrong}", numbers | change.numbers)
         reason = f"{change.reason}; held until an operator accepts it"
@@ -282,37 +282,37 @@ class Gate:
 
     # --- events and operators
 
-    def lose(self, reason: str) -> Answer:
+    def lose(self, reason: str) -> CommandEffect:
         """The sensor is silent or lost."""
         self._lost = True
-        return Answer(self.status, reason)
+        return CommandEffect(self.status, reason)
 
-    def regain(self, reason: str) -> Answer:
+    def regain(self, reason: str) -> CommandEffect:
         """The sensor sends data again. Held windows are older than the interruption and are dismissed."""
         self._lost = False
         self.dismiss()
-        return Answer(self.status, reason)
+        return CommandEffect(self.status, reason)
 
     def dismiss(self) -> None:
         """Dismiss the held windows, because the device with which they were made was replaced or interrupted."""
         self._held = self._agreeing = 0
 
-    def hold(self, key: str) -> Answer:
+    def hold(self, key: str) -> CommandEffect:
         """An operator puts the calibration on hold: no window is used."""
         if self._hold:
             return self._refused("the calibration is on hold already")
         self._hold = "operator"
         self._held = self._agreeing = 0
-        return Answer(self.status, f"put on hold by {key}")
+        return CommandEffect(self.status, f"put on hold by {key}")
 
-    def release(self, key: str) -> Answer:
+    def release(self, key: str) -> CommandEffect:
         """An operator ends the hold: windows are used again."""
         if not self._hold:
             return self._refused("the calibration is not on hold")
         self._hold = ""
-        return Answer(self.status, f"released by {key}")
+        return CommandEffect(self.status, f"released by {key}")
 
-    def accept(self, sequence: int, key: str) -> Answer:
+    def accept(self, sequence: int, key: str) -> CommandEffect:
         """An operator puts an Estimate in force. It becomes the new anchor."""
         found = [calibration for number, calibration in self._proposals if number == sequence and number]
         if not found:
@@ -320,21 +320,21 @@ class Gate:
             return self._refused(f"estimate {sequence} cannot be accepted; estimates that can be: {waiting}")
         return self._put_in_force(found[0], f"estimate {sequence} accepted by {key}")
 
-    def rollback(self, calibration: Calibration, key: str) -> Answer:
+    def rollback(self, calibration: Calibration, key: str) -> CommandEffect:
         """An operator puts an earlier calibration in force, on hold, because the next windows would undo the
         rollback."""
         answer = self._put_in_force(calibration, f"rolled back by {key}; on hold until an operator releases it")
         if answer.refused:
             return answer
         self._hold = "rollback"
-        return Answer(self.status, answer.reason, calibration=calibration)
+        return CommandEffect(self.status, answer.reason, calibration=calibration)
 
     def believe(self, calibration: Calibration) -> None:
         """The configuration states this calibration as an earlier one of the device: it is in force."""
         self._calibrated = True
         self._anchor.learn(calibration)
 
-    def _put_in_force(self, calibration: Calibration, reason: str) -> Answer:
+    def _put_in_force(self, calibration: Calibration, reason: str) -> CommandEffect:
         try:
             self._anchor = Anchor(self._settings, calibration)
         except ValueError as error:
@@ -342,10 +342,10 @@ class Gate:
         self._calibrated = True
         self._held = self._agreeing = self._settling = 0
         self._proposals = []
-        return Answer(self.status, reason, calibration=calibration)
+        return CommandEffect(self.status, reason, calibration=calibration)
 
-    def _refused(self, why: str) -> Answer:
-        return Answer(self.status, "", refused=why)
+    def _refused(self, why: str) -> CommandEffect:
+        return CommandEffect(self.status, "", refused=why)
 
     # --- state
 

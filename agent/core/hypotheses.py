@@ -34,7 +34,7 @@ NOTHING = np.zeros(12)  # of S and Q
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tried:
+class TriedStep:
     """A hypothesis: the state after its step and the held windows, by how much chi-squared grows, and how many unknowns
     the step has. `fits`: the held windows agree with it within what chance allows."""
 
@@ -152,11 +152,11 @@ def _of_sensor(state: State, held: Sequence[Record], leaning_rad: float = 0.0, w
     return state.changes(wider * possible_jump(state, held), leaning_rad, line=True, another_filter=True)
 
 
-def _tried(state: State, held: Sequence[Record], u: Mapping[str, float], limit: Limit, before: float) -> Tried:
+def _tried(state: State, held: Sequence[Record], u: Mapping[str, float], limit: Limit, before: float) -> TriedStep:
     after = state.after(held, u)
     grown = after.chi2 - before
     fits = grown <= limit(sum(record.rows for record in held)) and not _made_otherwise(state, after, held)
-    return Tried(after, grown, len(u), fits)
+    return TriedStep(after, grown, len(u), fits)
 
 
 def _made_otherwise(before: State, after: State, held: Sequence[Record]) -> bool:
@@ -166,7 +166,7 @@ def _made_otherwise(before: State, after: State, held: Sequence[Record]) -> bool
 
 
 def _of_either(
-    state: State, held: Sequence[Record], sensor: Tried, stability: float, limit: Limit, chi2: float
+    state: State, held: Sequence[Record], sensor: TriedStep, stability: float, limit: Limit, chi2: float
 ) -> State | None:
     """The sensor made the step, or the reference did: S follows, and its u covers both."""
     if not sensor.fits:

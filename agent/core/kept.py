@@ -43,7 +43,7 @@ MALFORMED = (ValueError, KeyError, TypeError, AttributeError, IndexError)  # a s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kept:
+class KeptEstimation:
     """The estimation with which a later run begins. `in_force` is None if no calibration was in force. `reason` says
     how much of the kept state is used.
 
@@ -103,7 +103,7 @@ def of_calibration(update: CalibrationUpdate) -> bytes:
     return pack({"in_force": plain(update), "device": "", "day": 0.0, "t_utc_ns": update.t_utc_ns})
 
 
-def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
+def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> KeptEstimation:
     """The estimation from the bytes of `keep`, as far as it is still valid. Raises ValueError as Estimation does.
 
     What the drivers stated of devices that have not been opened yet is taken over into `filters`.
@@ -114,7 +114,7 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
         in_force, day, t_utc_ns = update_of(state["in_force"]), float(state["day"]), int(state["t_utc_ns"])
     except MALFORMED as error:
         reason = f"begun again from the prior: the stored state cannot be read: {_said(error)}"
-        return Kept(Estimation(filters.channel, nominal), None, 0.0, 0, reason)
+        return KeptEstimation(Estimation(filters.channel, nominal), None, 0.0, 0, reason)
     if "estimation" not in state:
         return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, "nothing else was left")
     if isinstance(held := state["estimation"], dict) and held.get("state", held) is None:
@@ -130,12 +130,12 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
             return _kept_without_reference(state, fresh, in_force, were.channel, filters.channel, day, t_utc_ns)
         if wrong := _made_otherwise(changed, state["basis"], configured):
             reason = f"begun again from the prior: windows were made with other settings: {', '.join(wrong)}"
-            return Kept(fresh, None, day, t_utc_ns, reason)
+            return KeptEstimation(fresh, None, day, t_utc_ns, reason)
         stated = fresh.state.result()
         fresh.load(state["estimation"])
         if "prior" in changed and (beyond := fresh.gate.anchor_at(stated, fresh.in_force)):
             reason = f"begun again from the prior: the calibration in force contradicts the changed prior: {beyond}"
-            return Kept(Estimation(filters.channel, nominal), None, day, t_utc_ns, reason)
+            return KeptEstimation(Estimation(filters.channel, nominal), None, day, t_utc_ns, reason)
         size = _size(were.channel, filters.channel, fresh.state.reference_frequency_hz)
         gravity = _gravity(changed, state["basis"], configured)
         kept_state = fresh.state.copy()
@@ -150,7 +150,7 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> Kept:
         reason += f"; {OTHER_FILTERS}"
     if settled := fresh.state.settled_since(kept_state):
         reason += f"; {settled}"
-    return Kept(fresh, in_force, day, t_utc_ns, reason, moved)
+    return KeptEstimation(fresh, in_force, day, t_utc_ns, reason, moved)
 
 
 def _kept_without_reference(
@@ -161,7 +161,7 @@ def _kept_without_reference(
     channel: Channel,
     day: float,
     t_utc_ns: int,
-) -> Kept:
+) -> KeptEstimation:
     """The estimation as it was. What is stated now of the reference, which is away, and of a mount does not matter;
     only other filters of the sensor make S another one."""
     fresh.load(state["estimation"])
@@ -169,9 +169,9 @@ def _kept_without_reference(
                  fresh.state.reference_frequency_hz)  # fmt: skip
     if size is None:
         reason = "restored from the previous run"
-        return Kept(fresh, in_force, day, t_utc_ns, reason, means=state.get("means"))
+        return KeptEstimation(fresh, in_force, day, t_utc_ns, reason, means=state.get("means"))
     moved = fresh.restate(None, remounted=False, size=size)
-    return Kept(fresh, in_force, day, t_utc_ns, f"restored from the previous run; {OTHER_FILTERS}", moved)
+    return KeptEstimation(fresh, in_force, day, t_utc_ns, f"restored from the previous run; {OTHER_FILTERS}", moved)
 
 
 def _from_in_force(
@@ -182,11 +182,11 @@ def _from_in_force(
     day: float,
     t_utc_ns: int,
     why: str,
-) -> Kept:
+) -> KeptEstimation:
     """The estimation begun from the calibration in force, because the rest of the state is lost or cannot be read."""
     fresh = Estimation(channel, nominal)
     if in_force is None:
-        return Kept(fresh, None, day, t_utc_ns, f"begun again from the prior: {why}")
+        return KeptEstimation(fresh, None, day, t_utc_ns, f"begun again from the prior: {why}")
     try:
         fresh.gate.load(state["estimation"]["gate"])  # an operator's hold and the anchor stay
     except MALFORMED:
@@ -194,9 +194,9 @@ def _from_in_force(
         fresh.gate.release("")
         if refused:
             reason = f"begun again from the prior: {why}; {refused}"
-            return Kept(Estimation(channel, nominal), None, day, t_utc_ns, reason)
+            return KeptEstimation(Estimation(channel, nominal), None, day, t_utc_ns, reason)
     fresh.roll_back(calibration_of(in_force), day)
-    return Kept(fresh, in_force, day, t_utc_ns, f"begun again from the calibration in force: {why}")
+    return KeptEstimation(fresh, in_force, day, t_utc_ns, f"begun again from the calibration in force: {why}")
 
 
 def kept_as(kept: Mapping[str, bytes], identity: str, device: str) -> str:

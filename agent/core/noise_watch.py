@@ -29,7 +29,7 @@ KEPT = ("first", "usual", "newest", "grown")
 
 
 @dataclass(slots=True)
-class Noise:
+class NoiseHistory:
     """Of the windows beside one reference, all as logarithms: `first` (n, 4) motion and noise of the first ones,
     `usual` (3,) by how much a sound one may exceed what is expected, `newest` (k, 3) by how much the newest ones do,
     and `grown` (3,) what was told of that."""
@@ -73,7 +73,7 @@ class NoiseWatch:
     """Watches the noise of the windows of a sensor."""
 
     def __init__(self) -> None:
-        self._of: dict[str, Noise] = {}
+        self._of: dict[str, NoiseHistory] = {}
 
     def update(self, record: Record, scale: float) -> str:
         """The news of a window for the operator; "" if there is none. `scale`: output unit per m/s2."""
@@ -81,7 +81,7 @@ class NoiseWatch:
         density = record.noise / np.sqrt(record.independent)  # without filter: a narrower one passes less of it
         if not 0.0 < motion < np.inf or not (np.isfinite(density) & (density > 0.0)).all():
             return ""
-        known = self._of.pop(record.reference, None) or Noise()
+        known = self._of.pop(record.reference, None) or NoiseHistory()
         self._of = dict([*self._of.items(), (record.reference, known)][-MOST_REFERENCES:])
         changed = known.update(float(np.log(motion)), np.log(density))
         return "; ".join(_told(AXES[k], density[k] / scale, float(np.exp(more))) for k, more in changed)
@@ -92,7 +92,9 @@ class NoiseWatch:
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
-        self._of = {reference: Noise(*(np.array(own[name]) for name in KEPT)) for reference, own in state.items()}
+        self._of = {
+            reference: NoiseHistory(*(np.array(own[name]) for name in KEPT)) for reference, own in state.items()
+        }
 
 
 def _told(axis: str, noise_mps2: float, times: float) -> str:

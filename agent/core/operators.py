@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from agent.config import Channel, PoseInterval
 from agent.core.estimation import Estimation
 from agent.core.events import CalibrationUpdate, Command
-from agent.core.gate import Answer
+from agent.core.gate import CommandEffect
 from agent.core.outcome import calibration_of
 from agent.core.schedule import pose_of
 from calib.model import Pose
@@ -22,7 +22,7 @@ class CommandError(ValueError):
     """A command that cannot be carried out. The message says why."""
 
 
-def answer(command: Command, estimation: Estimation, identity: str) -> tuple[Answer, CalibrationUpdate | None]:
+def answer(command: Command, estimation: Estimation, identity: str) -> tuple[CommandEffect, CalibrationUpdate | None]:
     """Carry out hold, accept or rollback: the answer of the gate and, after a rollback, the update whose calibration is
     in force again.
 

@@ -33,7 +33,7 @@ MOST_TEMPERATURE_ORDER = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class ResultSource:
     """The sensor of the results and the time at which they are made. The pipeline adds run and sequence."""
 
     sensor: str
@@ -43,7 +43,7 @@ class Source:
 
 
 def calibration_update(
-    source: Source,
+    source: ResultSource,
     calibration: Calibration,
     state: State,
     shares: Sequence[ReferenceShare],
@@ -139,14 +139,16 @@ def calibration_of(update: CalibrationUpdate) -> Calibration:
     )  # fmt: skip
 
 
-def estimate(source: Source, reason: str, update: CalibrationUpdate) -> Estimate:
+def estimate(source: ResultSource, reason: str, update: CalibrationUpdate) -> Estimate:
     """A proposal that an operator can accept."""
     return Estimate(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns, reason=reason, calibration=update
     )
 
 
-def drift_report(source: Source, verdict: DriftVerdict, false_alarms_a_year: float, origin_utc_ns: int) -> DriftReport:
+def drift_report(
+    source: ResultSource, verdict: DriftVerdict, false_alarms_a_year: float, origin_utc_ns: int
+) -> DriftReport:
     """A verdict of the sequential test, with its onset in UTC."""
     onset = round(verdict.onset_s * 1e9) + origin_utc_ns if np.isfinite(verdict.onset_s) else 0
     return DriftReport(
@@ -158,7 +160,7 @@ def drift_report(source: Source, verdict: DriftVerdict, false_alarms_a_year: flo
 
 
 def window_report(
-    source: Source, window: Window, *, used: bool, reason: str, numbers: dict[str, float], fault: str = ""
+    source: ResultSource, window: Window, *, used: bool, reason: str, numbers: dict[str, float], fault: str = ""
 ) -> WindowReport:
     """The verdict on a window. Its numbers are those of the excitation, then those of the gate."""
     return WindowReport(
@@ -168,7 +170,7 @@ def window_report(
     )  # fmt: skip
 
 
-def status_change(source: Source, status: str, before: str, reason: str) -> StatusChange:
+def status_change(source: ResultSource, status: str, before: str, reason: str) -> StatusChange:
     """A change of status, or news while the status stays: for example why a command was refused."""
     return StatusChange(
         run_id="", sequence=0, sensor=source.sensor, t_utc_ns=source.t_utc_ns,

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from agent.config import Channel
-from agent.core.schedule import Piece, Stance, pieces
+from agent.core.schedule import PosePiece, Stance, pieces
 from agent.core.stream import UNCOUNTED, DeviceStream
-from calib.excitation.placing import Knowledge, Placed, clamp_angles, mean_output, nearest_stop
+from calib.excitation.placing import Placed, PlacingUncertainty, clamp_angles, mean_output, nearest_stop
 from calib.excitation.standing import KEPT, MEAN_S, Standing
 from calib.excitation.window_verdict import Limits
 from calib.model import Array, Pose
@@ -32,7 +32,7 @@ OPEN = Pose("unknown", np.zeros((3, 0)), np.full(3, np.nan))
 
 
 @dataclass(slots=True)
-class Stretch:
+class PositionStretch:
     """Between two changes of position; the newest one has no end yet.
 
     `serial` counts them. `smoothing_s` is how long the sensor's output must be averaged, because of slow motion.
@@ -56,7 +56,7 @@ class FoundPositions:
     def __init__(self, channel: Channel) -> None:
         self._channel, self._stops = channel, channel.stops
         self._standing = Standing()
-        self._stretches: list[Stretch] = []
+        self._stretches: list[PositionStretch] = []
         self._told: list[Stance] = []  # by operators, each until the next change
         self._angles: dict[int, Pose] = {}  # by serial: what is found first holds as long as nothing changes
         self._serial = 0
@@ -70,14 +70,14 @@ class FoundPositions:
     # --- pieces
 
     @property
-    def piece(self) -> Piece | None:
+    def piece(self) -> PosePiece | None:
         """The next piece; None while it may still change."""
         found = self._next()
         if found is None or (math.isinf(self._stretch_at(found.start_s).stop_s) and found.stop_s > self._cleared_s):
             return None
         return found
 
-    def done(self, piece: Piece) -> None:
+    def done(self, piece: PosePiece) -> None:
         """This piece is done."""
         self._after_s = piece.stop_s
         guard_s = self._channel.guard_s
@@ -88,7 +88,7 @@ class FoundPositions:
 
     def pass_over(self, time_s: float) -> None:
         """Leave out all pieces that begin before `time_s`."""
-        self.done(Piece(time_s, max(self._after_s, time_s), OPEN))
+        self.done(PosePiece(time_s, max(self._after_s, time_s), OPEN))
 
     @property
     def keep_from_s(self) -> float:
@@ -105,11 +105,11 @@ class FoundPositions:
             if told.start_s < at_s:
                 yield Stance(told.start_s, min(told.stop_s, at_s), told.pose)
 
-    def _next(self) -> Piece | None:
+    def _next(self) -> PosePiece | None:
         stances = [stance for stretch in self._stretches for stance in self._stances(stretch)]
         return next(pieces(self._channel, self._after_s, stances), None) if stances else None
 
-    def _stances(self, stretch: Stretch) -> Iterator[Stance]:
+    def _stances(self, stretch: PositionStretch) -> Iterator[Stance]:
         at_s = stretch.start_s
         for told in self._told:
             start_s, stop_s = max(told.start_s, at_s), min(told.stop_s, stretch.stop_s)
@@ -121,12 +121,12 @@ class FoundPositions:
         if at_s < stretch.stop_s:
             yield Stance(at_s, stretch.stop_s, OPEN)
 
-    def _stretch_at(self, time_s: float) -> Stretch:
+    def _stretch_at(self, time_s: float) -> PositionStretch:
         return next(s for s in self._stretches if s.start_s <= time_s < s.stop_s)
 
     # --- how it stands
 
-    def place(self, piece: Piece, cut: Samples | None, known: State, day: float) -> Placed:
+    def place(self, piece: PosePiece, cut: Samples | None, known: State, day: float) -> Placed:
         """How the sensor stands in a piece, by the mean of its samples `cut` and what is known of it on that day."""
         if piece.pose is not OPEN:
             return Placed(piece.pose, "", {})
@@ -149,7 +149,7 @@ class FoundPositions:
             self._angles[serial] = placed.pose
         return placed
 
-    def _unless_slipped(self, stretch: Stretch, placed: Placed) -> Placed:
+    def _unless_slipped(self, stretch: PositionStretch, placed: Placed) -> Placed:
         """A sensor that moved, and was not turned to another position, does not stand as that position is stated."""
         if placed.pose is None:
             return placed
@@ -167,10 +167,10 @@ class FoundPositions:
             None, f"{moved}, {most}; turn it to a position again", placed.numbers | {"slipped_mps2": stretch.moved_mps2}
         )
 
-    def _knowledge(self, scale: float) -> Knowledge:
+    def _knowledge(self, scale: float) -> PlacingUncertainty:
         u = self._channel.uncertainty
         angle_deg = math.hypot(u.angle_deg, u.alpha_common_deg, u.theta_deg, u.theta_position_deg)
-        return Knowledge(
+        return PlacingUncertainty(
             math.radians(angle_deg), u.gravity_mps2, scale * math.hypot(u.offset_mps2, u.offset_position_mps2)
         )
 
@@ -229,7 +229,9 @@ class FoundPositions:
             start_s = self._time_of(self._standing.first, size, stream)
             ended_s, centre = self._before
             moved_mps2 = float(np.linalg.norm(self._standing.centre - centre)) if start_s - ended_s < TURN_S else 0.0
-            self._stretches.append(Stretch(self._serial, start_s, math.inf, self._standing.smoothing_s, moved_mps2))
+            self._stretches.append(
+                PositionStretch(self._serial, start_s, math.inf, self._standing.smoothing_s, moved_mps2)
+            )
 
     def _end(self, number: int | None, size: int, stream: DeviceStream, *, before_restart: bool = False) -> None:
         """The stretch ends before the mean of this number, if any."""
@@ -270,7 +272,7 @@ class FoundPositions:
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
         self._standing.load(state["standing"])
-        self._stretches = [Stretch(**s) for s in state["stretches"]]
+        self._stretches = [PositionStretch(**s) for s in state["stretches"]]
         self._told = [Stance.load(s) for s in state["told"]]
         self._angles = {serial: Pose(**pose) for serial, pose in state["angles"]}
         self._serial, self._after_s, self._expected = state["serial"], state["after_s"], state["expected"]

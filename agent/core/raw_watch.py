@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from agent.core.stream import SATURATED, UNCOUNTED, DeviceStream
 from calib.geometry import AXES
 from calib.model import Array
-from calib.signal.outputs import Held, Outputs
+from calib.signal.outputs import Outputs, StuckOutput
 from hw.block import SampleBlock
 
 AGAIN_S = 600.0  # between two messages on one output
@@ -26,14 +26,14 @@ LEAST_END = 128.0  # of a converter: of one with 8 bits
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class OutputFault:
     """What is wrong with a device from one time to another, in s since the run's origin; `held` where it is an output
     that does not change, and `said` for an operator."""
 
     said: str
     start_s: float
     stop_s: float
-    held: Held | None = None
+    held: StuckOutput | None = None
 
 
 class RawWatch:
@@ -42,7 +42,7 @@ class RawWatch:
     def __init__(self, keep_s: float) -> None:
         self._keep_s = keep_s
         self._outputs: dict[str, Outputs] = {}
-        self._faults: dict[str, list[Fault]] = {}
+        self._faults: dict[str, list[OutputFault]] = {}
         self._told_s: dict[str, dict[str, float]] = {}  # when the message of a kind was told last, by device
         self._seen: dict[str, list[tuple[float, list[int]]]] = {}  # times and counts of what happens now and then
         self._flipping: set[str] = set()  # devices of which wrong bits are told
@@ -72,7 +72,7 @@ class RawWatch:
         anew, repeats = bool(int(block.flags) & UNCOUNTED), outputs.repeats
         outputs.update(block.first_index, x, block.nominal_rate_hz, block.burst_count, anew=anew)
         now_s = (block.t_monotonic_ns - stream.origin_ns) * 1e-9
-        told, faults = [], list[Fault]()
+        told, faults = [], list[OutputFault]()
         for fault in self._faults.get(block.device, []):
             if fault.stop_s == np.inf and fault.held is not None and (anew or not outputs.goes_on(fault.held)):
                 if now_s - fault.start_s >= WORTH_S:
@@ -85,11 +85,11 @@ class RawWatch:
             if held.axis not in known:
                 start_s = float(np.clip(np.nan_to_num(stream.taken_at(held.first)[0], nan=now_s), 0.0, now_s))
                 said = f"{block.device}: {_what(held, block)} since {_utc(origin_utc_ns, start_s)}"
-                faults.append(Fault(said, start_s, np.inf, held))
+                faults.append(OutputFault(said, start_s, np.inf, held))
                 told += self._once(block.device, f"held {held.axis}", said, now_s)
         if outputs.repeats > repeats:
             start_s = now_s - 2.0 * len(x) / block.nominal_rate_hz
-            faults.append(Fault(f"{block.device}: its driver gave the same samples twice", start_s, now_s))
+            faults.append(OutputFault(f"{block.device}: its driver gave the same samples twice", start_s, now_s))
         self._faults[block.device] = faults
         return told + list(self._now_and_then(block.device, outputs, now_s))
 
@@ -160,15 +160,15 @@ class RawWatch:
         self._flipping = set(state.get("flipping", []))
 
 
-def _fault(state: Mapping[str, Any]) -> Fault:
-    return Fault(**{**state, "held": None if state["held"] is None else Held(**state["held"])})
+def _fault(state: Mapping[str, Any]) -> OutputFault:
+    return OutputFault(**{**state, "held": None if state["held"] is None else StuckOutput(**state["held"])})
 
 
 def _axis(axis: int, of: int) -> str:
     return AXES[axis] if of == len(AXES) else "its output"
 
 
-def _what(held: Held, block: SampleBlock) -> str:
+def _what(held: StuckOutput, block: SampleBlock) -> str:
     """In words, with the values as the device gives them."""
     name, low, high = _axis(held.axis, block.indications.shape[1]), f"{held.low:.10g}", f"{held.high:.10g}"
     if held.low != held.high:

@@ -16,7 +16,7 @@ from calib.model import Pose
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class PosePiece:
     """An interval of time in one pose, without the guards at its ends; seconds since the sensor's first sample."""
 
     start_s: float
@@ -59,7 +59,7 @@ class ToldTimes:
         self._upcoming = pieces(self._channel, self._after_s, self._stances)
         self.piece = next(self._upcoming, None)
 
-    def done(self, piece: Piece) -> None:
+    def done(self, piece: PosePiece) -> None:
         """This piece is done; the next one becomes `piece`."""
         self._after_s = piece.stop_s
         self.piece = next(self._upcoming, None)
@@ -95,7 +95,7 @@ class ToldTimes:
         self._plan()
 
 
-def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> Iterator[Piece]:
+def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> Iterator[PosePiece]:
     """The pieces after `after_s`, in order of time; without end if the schedule repeats.
 
     If there are `stances`, they replace the poses of the configuration.
@@ -103,7 +103,7 @@ def pieces(channel: Channel, after_s: float, stances: Sequence[Stance] = ()) -> 
     stretches = ((s.start_s, s.stop_s, s.pose) for s in stances) if stances else _stretches(channel, after_s)
     for start_s, stop_s, pose in stretches:
         cut = pieces_of(start_s, stop_s, channel.window_s, channel.guard_s, channel.every_s, after_s)
-        yield from (Piece(first_s, last_s, pose) for first_s, last_s in cut)
+        yield from (PosePiece(first_s, last_s, pose) for first_s, last_s in cut)
 
 
 def _stretches(channel: Channel, after_s: float) -> Iterator[tuple[float, float, Pose]]:

@@ -31,7 +31,7 @@ def unpack(data: bytes) -> dict[str, Any]:
     Raises ValueError if the bytes are no snapshot, or if this program does not know their version.
     """
     try:
-        held = msgspec.msgpack.decode(data, ext_hook=_Arrays().decode)
+        held = msgspec.msgpack.decode(data, ext_hook=_PackedArrays().decode)
         version, state = held["version"], held["state"]
     except (msgspec.DecodeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"not a snapshot: {error}") from None
@@ -66,7 +66,7 @@ def _without_zeros(data: bytes, size: int) -> bytes:
     return bytes(np.packbits(there).tobytes() + elements[there].tobytes())
 
 
-class _Arrays:
+class _PackedArrays:
     """The arrays of one snapshot. Whoever wrote it, they take no more memory than its bytes and _MOST_SPARSE allow."""
 
     def __init__(self) -> None:

@@ -28,7 +28,7 @@ UNCOUNTED = int(BlockFlags.RESTART | BlockFlags.OVERRUN)
 SATURATED = int(BlockFlags.SATURATED)  # as integers: flags of an enumeration take 15 times as long
 
 
-class Run:
+class BlockRun:
     """Blocks whose samples are counted on from each other, with the clock of these samples."""
 
     def __init__(self, clock: ClockModel, number: int = 0) -> None:
@@ -85,7 +85,7 @@ class Run:
         }
 
     @classmethod
-    def restore(cls, state: Mapping[str, Any]) -> Run:
+    def restore(cls, state: Mapping[str, Any]) -> BlockRun:
         """The run whose `snapshot` this is."""
         run = cls(ClockModel.restore(state["clock"]), state["number"])
         run.blocks.extend(_block_of(s) for s in state["blocks"])
@@ -97,7 +97,7 @@ class DeviceStream:
     """Holds the blocks of one device until `forget_before` drops them.
 
     Times are seconds since the run's origin on the gateway's monotonic clock. After a RESTART or an OVERRUN (nobody can
-    count the samples on) a new `Run` begins, with a clock of its own; runs before are kept as long as they are needed.
+    count the samples on) a new run begins, with a clock of its own; runs before are kept as long as they are needed.
     """
 
     def __init__(self, name: str, origin_ns: int, horizon_s: float = HORIZON_S) -> None:
@@ -105,7 +105,7 @@ class DeviceStream:
         self._name = name
         self.origin_ns = origin_ns
         self._horizon_s = horizon_s
-        self._runs: list[Run] = []  # in order of time; of all but the newest there are blocks
+        self._runs: list[BlockRun] = []  # in order of time; of all but the newest there are blocks
         self.newest_arrival_s: float | None = None
         self.first_sample_s: float | None = None
 
@@ -118,7 +118,7 @@ class DeviceStream:
         if not self._runs or int(block.flags) & UNCOUNTED:
             number = self._runs[-1].number + 1 if self._runs else 0
             self._runs = [run for run in self._runs if run.blocks]
-            self._runs.append(Run(ClockModel(block.nominal_rate_hz, self._horizon_s), number))
+            self._runs.append(BlockRun(ClockModel(block.nominal_rate_hz, self._horizon_s), number))
         self._runs[-1].update(block, arrivals_s)
         self.newest_arrival_s = float(arrivals_s[-1])
 
@@ -229,7 +229,7 @@ class DeviceStream:
         within = start_s - 1 / rate_hz <= times_s[0] and times_s[-1] <= stop_s + 1 / rate_hz
         return found if within and (times_s[1:] > times_s[:-1]).all() else replace(found, in_time=False)
 
-    def _run_of(self, start_s: float, stop_s: float) -> Run | None:
+    def _run_of(self, start_s: float, stop_s: float) -> BlockRun | None:
         held = [run for run in self._runs if run.blocks]
         if len(held) < 2:
             return held[0] if held else None
@@ -270,7 +270,7 @@ class DeviceStream:
     def restore(cls, name: str, origin_ns: int, state: dict[str, Any], horizon_s: float = HORIZON_S) -> DeviceStream:
         """The stream from its `snapshot`."""
         stream = cls(name, origin_ns, horizon_s)
-        stream._runs = [Run.restore(run) for run in state["runs"]]
+        stream._runs = [BlockRun.restore(run) for run in state["runs"]]
         stream.newest_arrival_s = state["newest_arrival_s"]
         stream.first_sample_s = state["first_sample_s"]
         return stream

@@ -14,10 +14,10 @@ from agent.config import Channel
 from agent.core.estimation import DAY_S, Estimation, Judged
 from agent.core.positions import FOUND_WITHIN_S, FoundPositions
 from agent.core.raw_watch import RawWatch
-from agent.core.schedule import Piece, ToldTimes, pose_beside
+from agent.core.schedule import PosePiece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
 from agent.core.time_shift import Anew
-from agent.core.windows import Found, aligned_in, limits_of, margin_of, refused, windows_in
+from agent.core.windows import StretchWindows, aligned_in, limits_of, margin_of, refused, windows_in
 from calib.excitation.front_end import most_margin_s
 from calib.excitation.lag_search import without_lag
 from calib.excitation.placing import Placed
@@ -31,7 +31,7 @@ FOUND_EDGE_S = 1.0  # from a hole to the end of the stretch that it ends, where 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+class JudgedWindow:
     """A window and what the estimation made of it; None where it was not asked, for the reason in the window.
 
     `lag_s` was taken out of the sensor's times.
@@ -143,7 +143,7 @@ class Streams:
         first_s = self._sensor.first_sample_s
         self._places.turn(0.0 if first_s is None else now_s - first_s, pose)
 
-    def due(self, now_s: float) -> Iterator[Piece]:
+    def due(self, now_s: float) -> Iterator[PosePiece]:
         """The pieces whose samples are all there, or later than anybody waits for; what is old is then forgotten.
 
         Between two events pass a few pieces at most. If more than MOST_DUE are due, the time has jumped: those that end
@@ -169,8 +169,8 @@ class Streams:
             stream.forget_before(keep_from_s)
 
     def verdicts(
-        self, piece: Piece, first_day: float, estimation: Estimation | None, unusable: str
-    ) -> Iterator[Verdict]:
+        self, piece: PosePiece, first_day: float, estimation: Estimation | None, unusable: str
+    ) -> Iterator[JudgedWindow]:
         """A verdict on each window of a piece. `first_day` is the run's origin in the estimation's own count.
 
         `unusable` says why the reference may not be used, "" where it may. The parts of the piece between which a
@@ -188,7 +188,7 @@ class Streams:
             for verdict in self._of_part(part, first_s, first_day, estimation, unusable):
                 yield replace(verdict, window=told_in(verdict.window, missing))
 
-    def _parts(self, piece: Piece, first_s: float) -> list[Piece]:
+    def _parts(self, piece: PosePiece, first_s: float) -> list[PosePiece]:
         """What lies between the breaks of both devices; the whole piece where no part of it is long enough."""
         start_s, stop_s = first_s + piece.start_s, first_s + piece.stop_s
         breaks = [found for stream in self._in_use.values() for found in stream.breaks(start_s, stop_s)]
@@ -201,7 +201,7 @@ class Streams:
             at_s = max(at_s, began_s)
         return parts or [piece]
 
-    def _missing(self, piece: Piece, first_s: float) -> dict[str, float]:
+    def _missing(self, piece: PosePiece, first_s: float) -> dict[str, float]:
         """Numbers for the windows of a piece that holes cut, or end where a position was found by gravity."""
         beyond_s = self._channel.guard_s + FOUND_EDGE_S if self._finder else 0.0
         start_s, stop_s = first_s + piece.start_s - beyond_s, first_s + piece.stop_s + beyond_s
@@ -214,18 +214,18 @@ class Streams:
         return {name: float(count) for name, count in numbers.items() if count}
 
     def _of_part(
-        self, piece: Piece, first_s: float, first_day: float, estimation: Estimation | None, unusable: str
-    ) -> Iterator[Verdict]:
+        self, piece: PosePiece, first_s: float, first_day: float, estimation: Estimation | None, unusable: str
+    ) -> Iterator[JudgedWindow]:
         day = first_day + (first_s + piece.stop_s) / DAY_S
         placed, lag_s, anew = Placed(piece.pose, "", {}), 0.0, None
         span_s = first_s + piece.start_s, first_s + piece.stop_s
         if unsound := self._unsound(*span_s) or self._raw.reason(self._in_use, *span_s):
-            found = Found([refused(piece, unsound)])
+            found = StretchWindows([refused(piece, unsound)])
         else:
             self._look_for_restarts(first_s + piece.start_s, first_s + piece.stop_s, estimation)
             placed = self._placed(piece, first_s, day, estimation)
             if placed.pose is None or unusable:
-                found = Found([refused(piece, unusable or placed.reason)])
+                found = StretchWindows([refused(piece, unusable or placed.reason)])
             else:
                 found, lag_s, anew = self._found(replace(piece, pose=placed.pose), first_s, day, estimation)
         found = found.told(placed.numbers)
@@ -234,7 +234,7 @@ class Streams:
             if window.used and estimation is not None:
                 judged = estimation.judge(window, day, lag_s, found.temperature_degc, anew)
                 anew = None  # the first window has set the lag in the state
-            yield Verdict(window, judged, lag_s)
+            yield JudgedWindow(window, judged, lag_s)
 
     def _look_for_restarts(self, start_s: float, stop_s: float, estimation: Estimation | None) -> None:
         """A device that began to count anew since the last part may be late by another time."""
@@ -299,7 +299,7 @@ class Streams:
                     return f"{name}: {what} is {beyond[0]:.6g}, too large to compute with ({LARGEST:g} at most)"
         return ""
 
-    def _placed(self, piece: Piece, first_s: float, day: float, estimation: Estimation | None) -> Placed:
+    def _placed(self, piece: PosePiece, first_s: float, day: float, estimation: Estimation | None) -> Placed:
         """How the sensor stands in the piece, where nobody told."""
         if self._finder is None or estimation is None:
             return Placed(piece.pose, "", {})
@@ -307,8 +307,8 @@ class Streams:
         return self._finder.place(piece, cut, estimation.state, day)
 
     def _found(
-        self, piece: Piece, first_s: float, day: float, estimation: Estimation | None
-    ) -> tuple[Found, float, Anew | None]:
+        self, piece: PosePiece, first_s: float, day: float, estimation: Estimation | None
+    ) -> tuple[StretchWindows, float, Anew | None]:
         """The windows, made again until neither a lag nor a response is left in them that matters; what a search for
         another lag found."""
         if estimation is None or self._channel.reference is None:
@@ -317,7 +317,7 @@ class Streams:
         lag_s, response = estimation.lag_s, estimation.response
         trial, known = estimation.state, estimation.state.response_is_known
 
-        def lag_of(found: Found, lag_s: float) -> float:
+        def lag_of(found: StretchWindows, lag_s: float) -> float:
             nonlocal trial
             # What contradicts a known state must not move its lag: that would be an answer to another question.
             if known and estimation.contradicted(found, day, lag_s):
@@ -339,14 +339,14 @@ class Streams:
 
     def _explained(
         self,
-        piece: Piece,
+        piece: PosePiece,
         first_s: float,
         day: float,
         estimation: Estimation,
-        found: Found,
+        found: StretchWindows,
         lag_s: float,
         response: Response,
-    ) -> tuple[Found, float, Anew | None]:
+    ) -> tuple[StretchWindows, float, Anew | None]:
         """As `_found`, of windows that contradict: those of the part whose samples have the known lag, where others
         have not; else those at another lag, if one explains them; else what was found."""
         state, watch, to_hz = estimation.state, estimation.lag_watch, estimation.state.motion_to_hz
@@ -366,6 +366,6 @@ class Streams:
             return anew.found, anew.lag_s, anew
         return found.because(watch.beyond), lag_s, None
 
-    def _make(self, piece: Piece, first_s: float, response: Response, to_hz: float, lag_s: float) -> Found:
+    def _make(self, piece: PosePiece, first_s: float, response: Response, to_hz: float, lag_s: float) -> StretchWindows:
         beside, limits = self._beside[self.place], self._limits[self.place]
         return windows_in(piece, first_s, beside, self.by_device, lag_s, response, to_hz, limits)

@@ -16,7 +16,7 @@ import numpy as np
 
 from agent.config import Channel
 from agent.core.gate import Limit
-from agent.core.windows import Found
+from agent.core.windows import StretchWindows
 from calib.estimate.nuisances import Priors
 from calib.excitation.front_end import Aligned
 from calib.excitation.lag_search import BASIN_RAD, largest_omega, longest_in_time, minima, misfit_by_lag, without_lag
@@ -40,7 +40,7 @@ class Anew:
     be taken although this lag explains them; otherwise "".
     """
 
-    found: Found
+    found: StretchWindows
     lag_s: float
     base: State
     shifted: bool
@@ -48,7 +48,7 @@ class Anew:
 
 
 @dataclass(slots=True)
-class Line:
+class LagChange:
     """The lag may have changed and no window was taken since: the lag in s before, its u, and the devices concerned."""
 
     before_s: float
@@ -75,7 +75,7 @@ class LagWatch:
     def __init__(self, channel: Channel, limit: Limit) -> None:
         self._channel, self._limit = channel, limit
         self._priors = channel.priors(fixed_mount=channel.fixed_mount)
-        self._line: Line | None = None
+        self._line: LagChange | None = None
         self._excluded_s: float | None = None  # the lag at which the newest search failed
         self._unexplained = 0  # pieces since then whose outputs would fit best at that lag
         self.beyond = ""  # why the lag that explains the newest pieces must not be used
@@ -83,8 +83,8 @@ class LagWatch:
     def search(
         self,
         state: State,
-        make: Callable[[float], Found],
-        contradicting: Found,
+        make: Callable[[float], StretchWindows],
+        contradicting: StretchWindows,
         lag_s: float,
         pose: Pose,
         samples: Aligned,
@@ -131,7 +131,7 @@ class LagWatch:
 
     def shifted(self, state: State) -> None:
         """The lag is another now than in `state`."""
-        self._line = self._line or Line(*state.quantity("lag"), [])
+        self._line = self._line or LagChange(*state.quantity("lag"), [])
 
     def forget(self) -> None:
         """Another reference has a lag of its own."""
@@ -154,7 +154,7 @@ class LagWatch:
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Take the state that `snapshot` gave."""
-        self._line = None if state["line"] is None else Line(**state["line"])
+        self._line = None if state["line"] is None else LagChange(**state["line"])
         self._excluded_s, self._unexplained = state["excluded_s"], state["unexplained"]
         self.beyond = state["beyond"]
 
@@ -191,8 +191,8 @@ def search(
     state: State,
     priors: Priors,
     limit: Limit,
-    make: Callable[[float], Found],
-    contradicting: Found,
+    make: Callable[[float], StretchWindows],
+    contradicting: StretchWindows,
     taken_s: float,
     lags_s: Sequence[float],
     day: float,
@@ -206,14 +206,14 @@ def search(
     loose.step(loose.changes(np.zeros(12), line=True))
     mean_s, within_s, _ = _ranges(priors)
 
-    def with_records(found: Found, lag_s: float) -> tuple[Found, list[Record]]:
+    def with_records(found: StretchWindows, lag_s: float) -> tuple[StretchWindows, list[Record]]:
         told = lag_s, found.temperature_degc, state.reference, state.motion_to_hz
         return found, [Record.of(window, day, *told) for window in found.used]
 
-    def made(lag_s: float) -> tuple[Found, list[Record]]:
+    def made(lag_s: float) -> tuple[StretchWindows, list[Record]]:
         return with_records(make(lag_s), lag_s)
 
-    def lag_after(made: tuple[Found, list[Record]], _: float) -> float:
+    def lag_after(made: tuple[StretchWindows, list[Record]], _: float) -> float:
         return loose.lag_with(max(made[1], key=lambda record: record.count))
 
     before = with_records(contradicting, taken_s)[1]

@@ -41,7 +41,7 @@ class Hour:
     power: Array  # (6, B) as spectra.PAIRS
 
 
-class Watch:
+class SensorWatch:
     """Takes the blocks of a sensor and gives an `Hour` after each hour of UTC that has samples."""
 
     def __init__(self) -> None:

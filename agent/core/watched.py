@@ -9,7 +9,7 @@ from agent.config import Channel
 from agent.core.estimation import DAY_S, STATED
 from agent.core.events import CalibrationUpdate, WatchReport
 from agent.core.mean_watch import MeanWatch
-from agent.core.outcome import Source, again
+from agent.core.outcome import ResultSource, again
 from agent.core.watch import HOUR_NS, Hour
 from calib.estimate.correction import Law
 from calib.model import Array, Calibration, scale_of
@@ -58,7 +58,7 @@ def _walked(channel: Channel, in_force: CalibrationUpdate, t_utc_ns: int) -> Arr
     return channel.wander().variance_after(hours / 24.0, scale, 0.0, drift)
 
 
-def in_force_since(in_force: CalibrationUpdate, law: Law, source: Source) -> CalibrationUpdate:
+def in_force_since(in_force: CalibrationUpdate, law: Law, source: ResultSource) -> CalibrationUpdate:
     """The calibration in force with the U that it has by the law now: the same calibration, with the same date."""
     covariance = law.covariance[:12, :12]
     variance = covariance.diagonal()
@@ -72,7 +72,7 @@ def in_force_since(in_force: CalibrationUpdate, law: Law, source: Source) -> Cal
 
 
 def watch_report(
-    source: Source, hour: Hour, in_force: CalibrationUpdate | None, law: Law, means: MeanWatch
+    source: ResultSource, hour: Hour, in_force: CalibrationUpdate | None, law: Law, means: MeanWatch
 ) -> WatchReport:
     """The result of an hour, of which `means` takes note."""
     made = ("", 0) if in_force is None else in_force.made

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agent.config import Channel
-from agent.core.schedule import Piece
+from agent.core.schedule import PosePiece
 from agent.core.stream import DeviceStream
 from calib.excitation.front_end import (
     LEAST_MARGIN_S,
@@ -28,7 +28,7 @@ from calib.windows.bands import ABOVE, HIGHEST, motion_band_hz, share_above
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class StretchWindows:
     """The windows of a stretch, in seconds since the sensor's first sample; its temperature, NaN where none is told."""
 
     windows: list[Window]
@@ -39,23 +39,23 @@ class Found:
         """Those of the windows that are used."""
         return [window for window in self.windows if window.used]
 
-    def because(self, why: str) -> Found:
+    def because(self, why: str) -> StretchWindows:
         """The same with `why` added to the reasons of the windows that are not used; "" adds nothing."""
         if not why:
             return self
         return replace(self, windows=[w if w.used else replace(w, reason=f"{w.reason}; {why}") for w in self.windows])
 
-    def refused(self, reason: str) -> Found:
+    def refused(self, reason: str) -> StretchWindows:
         """The same, none of the windows used for this reason."""
         return replace(self, windows=[replace(w, used=False, reason=w.reason or reason) for w in self.windows])
 
-    def told(self, numbers: Mapping[str, float]) -> Found:
+    def told(self, numbers: Mapping[str, float]) -> StretchWindows:
         """The same with numbers more in each window."""
         return replace(self, windows=[replace(w, numbers={**w.numbers, **numbers}) for w in self.windows])
 
 
 def windows_in(
-    piece: Piece,
+    piece: PosePiece,
     first_s: float,
     channel: Channel,
     streams: dict[str, DeviceStream],
@@ -63,7 +63,7 @@ def windows_in(
     response: Response = FLAT,
     to_hz: float = np.inf,
     limits: Limits = DEFAULT_LIMITS,
-) -> Found:
+) -> StretchWindows:
     """The windows of a stretch in one pose, each with its verdict; one unused window where there is nothing to judge.
 
     `first_s` is the time of the sensor's first sample; the windows' times count from it. The sensor's indications are
@@ -85,15 +85,15 @@ def windows_in(
             motion_hz = motion_band_hz(found, lasting=True)
             found = [replace(window, motion_hz=motion_hz) for window in made(to_hz)]
     except Unusable as error:
-        return Found([refused(piece, str(error))])
+        return StretchWindows([refused(piece, str(error))])
     if not found:
-        return Found([refused(piece, "the samples of sensor and reference do not overlap in time")])
+        return StretchWindows([refused(piece, "the samples of sensor and reference do not overlap in time")])
     found = [replace(w, start_s=w.start_s - first_s, stop_s=w.stop_s - first_s) for w in found]
-    return Found(found, sensor.temperature_degc)
+    return StretchWindows(found, sensor.temperature_degc)
 
 
 def aligned_in(
-    piece: Piece,
+    piece: PosePiece,
     first_s: float,
     channel: Channel,
     streams: dict[str, DeviceStream],
@@ -142,6 +142,6 @@ def margin_of(channel: Channel, streams: Mapping[str, DeviceStream]) -> float:
     return LEAST_MARGIN_S if rate_hz is None else margin_s(channel.instrument, rate_hz)
 
 
-def refused(piece: Piece, reason: str) -> Window:
+def refused(piece: PosePiece, reason: str) -> Window:
     """The window of a piece in which there is nothing to judge."""
     return nothing_in(piece.pose, piece.start_s, piece.stop_s, reason)

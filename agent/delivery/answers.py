@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import zenoh
 
-from agent.delivery.history import History, Record, StoreError
+from agent.delivery.history import History, StoredResult, StoreError
 from agent.delivery.keys import result_key
 
 REPLIES_MAX = 500  # results per query, about 1 MB; the consumer asks again from the last number until nothing comes
@@ -56,7 +56,7 @@ def answer_queries(
                 _log.warning("a query could not be answered: %s", error)
 
 
-def attachment_of(record: Record, previous: str = "") -> bytes:
+def attachment_of(record: StoredResult, previous: str = "") -> bytes:
     """The attachment of a result: the number of the one before, and after a line break the signed result, if any."""
     return previous.encode() + (b"\n" + record.signed if record.signed else b"")
 
@@ -69,7 +69,7 @@ def _reply_told(query: zenoh.Query, gateway: str, told: Mapping[str, bytes]) -> 
     return bool(matching)
 
 
-def _answers(query: zenoh.Query, gateway: str, open_store: Callable[[], History]) -> tuple[list[Record], int]:
+def _answers(query: zenoh.Query, gateway: str, open_store: Callable[[], History]) -> tuple[list[StoredResult], int]:
     """(the records asked for, the number up to which some of them have been deleted, or 0)."""
     after = query.parameters.get("after")
     with open_store() as history:

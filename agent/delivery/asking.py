@@ -6,10 +6,10 @@ import logging
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 
-from agent.delivery.holding import Held
+from agent.delivery.holding import WaitingResults
 from agent.delivery.keys import narrow
 from agent.delivery.progress import Progress
-from agent.delivery.questions import Answer, Dialogue
+from agent.delivery.questions import Dialogue, GatewayAnswer
 from agent.delivery.received import Received
 from agent.delivery.seldom import Seldom
 
@@ -18,13 +18,13 @@ UNCONFIRMED_MAX = 1000  # results given as unconfirmed that are remembered, so t
 _log = logging.getLogger(__name__)
 
 
-class Asking:
+class Dialogues:
     """The dialogues with gateways about results under the key expression `key`.
 
     `progress`: how far the consumer has come; what is given moves it. `held`: results that wait for earlier ones.
     """
 
-    def __init__(self, key: str, progress: Progress, held: Held) -> None:
+    def __init__(self, key: str, progress: Progress, held: WaitingResults) -> None:
         self._key, self._progress, self._held = key, progress, held
         self._told: dict[str, int] = {}  # by source: number up to which the user was told that results are removed
         self._unconfirmed: dict[tuple[str, str, int], Received] = {}  # given already, although the store had them not
@@ -55,7 +55,7 @@ class Asking:
         if self._held.asked(source, answered=answered, known=self._progress.number(source) is not None):
             yield from self._deliver_unconfirmed(*self._held.pop(source))
 
-    def _newest(self, source: str, selector: str) -> Generator[str, Answer, Sequence[Received] | None]:
+    def _newest(self, source: str, selector: str) -> Generator[str, GatewayAnswer, Sequence[Received] | None]:
         """Results of the epoch that the gateway's store has now; None where it does not answer."""
         last = self._progress.number(source) or 0
         answer = yield f"{selector}?after={max(0, last - 1)}"  # the last one known, where the store still has it
@@ -63,7 +63,7 @@ class Asking:
             answer = yield selector
         return answer.results if answer.answered else None
 
-    def _other_epochs(self, selector: str, signs: Sequence[Received]) -> Generator[str, Answer, dict[str, None]]:
+    def _other_epochs(self, selector: str, signs: Sequence[Received]) -> Generator[str, GatewayAnswer, dict[str, None]]:
         """The epochs of these results that are not known yet and that the gateway's store has."""
         other = {r.epoch for r in signs if self._progress.is_other_epoch(r)}
         if not other:
@@ -73,7 +73,7 @@ class Asking:
 
     def _pages(
         self, source: str, question: str, after: int, others: dict[str, None], epoch: str | None = None
-    ) -> Generator[Received | str, Answer, bool]:
+    ) -> Generator[Received | str, GatewayAnswer, bool]:
         """Ask until nothing more comes; returns whether the gateway answered.
 
         Results of other epochs are not given, but these epochs are added to `others`; with `epoch`, only its results
@@ -94,7 +94,7 @@ class Asking:
                 results[0] = replace(results[0], removed_up_to=removed)
             yield from self.deliver(*results)
 
-    def _find_epoch(self, source: str, selector: str, signs: Sequence[Received]) -> Generator[str, Answer, None]:
+    def _find_epoch(self, source: str, selector: str, signs: Sequence[Received]) -> Generator[str, GatewayAnswer, None]:
         """Find the epoch of a number that was given without one: that of the result with this number in the store."""
         known = self._progress.number(source)
         if known is None or not self._progress.without_epoch(source):

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from agent.delivery.history import History, Record
+from agent.delivery.history import History, StoredResult
 
 
-def made(record: Record) -> tuple[str, int]:
+def made(record: StoredResult) -> tuple[str, int]:
     """(run, sequence) of the result by which the calibration of this record first came into force."""
     fields = record.fields
     sequence = fields.get("made_sequence")
     return (str(fields.get("made_run_id")), int(sequence)) if sequence else (record.run_id, record.sequence)
 
 
-def date_utc_ns(record: Record) -> int:
+def date_utc_ns(record: StoredResult) -> int:
     """When the calibration of this record was made."""
     return int(record.fields.get("made_utc_ns") or record.t_utc_ns)
 
 
-def calibrations(history: History, sensor: str, *, limit: int) -> list[Record]:
+def calibrations(history: History, sensor: str, *, limit: int) -> list[StoredResult]:
     """The newest `limit` calibrations of a sensor, newest first by when they were made.
 
     Each is the record of when it was made; of one that retention deleted, the record by which it came into force last.
@@ -25,7 +25,7 @@ def calibrations(history: History, sensor: str, *, limit: int) -> list[Record]:
     asked = limit
     while True:
         records = history.newest(sensor, "calibration", limit=asked)
-        once: dict[tuple[str, int], Record] = {}
+        once: dict[tuple[str, int], StoredResult] = {}
         for record in records:
             once.setdefault(made(record), record)
         if len(once) >= limit or len(records) < asked:
@@ -35,7 +35,7 @@ def calibrations(history: History, sensor: str, *, limit: int) -> list[Record]:
     return [_first(history, record) for record in newest]
 
 
-def _first(history: History, record: Record) -> Record:
+def _first(history: History, record: StoredResult) -> StoredResult:
     run_id, sequence = made(record)
     found = history.after(sequence - 1, [(record.sensor, "calibration")], limit=1)
     there = bool(found) and (found[0].run_id, found[0].sequence) == (run_id, sequence)

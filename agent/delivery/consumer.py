@@ -18,15 +18,15 @@ import zenoh
 
 from agent.config.known_keys import WatchedKeys
 from agent.config.tls import TlsFiles
-from agent.delivery.asking import Asking
+from agent.delivery.asking import Dialogues
 from agent.delivery.hearing import Hearing
-from agent.delivery.holding import Held
+from agent.delivery.holding import WaitingResults
 from agent.delivery.instances import Instances
 from agent.delivery.keys import PREFIX, parse_key
-from agent.delivery.memory import Memory
+from agent.delivery.memory import ProcessedNumbers
 from agent.delivery.presence import Presence
 from agent.delivery.progress import Progress
-from agent.delivery.questions import Answer, Dialogue, Questions, Replies, answer_of, steps
+from agent.delivery.questions import Dialogue, GatewayAnswer, Questions, Replies, answer_of, steps
 from agent.delivery.received import Received, number_of, receive
 from agent.delivery.session import session_config
 from agent.delivery.turns import Turns
@@ -95,14 +95,14 @@ class Consumer:
     ) -> None:
         self._verifier = Verifier(WatchedKeys(keys), trust_first=trust_first) if keys is not None else None
         self._refusals, self._malformed = Refusals(), Refusals()
-        self._memory = Memory(memory)
+        self._memory = ProcessedNumbers(memory)
         self._progress = Progress(self._memory.numbers | dict(last_sequence or {}))
         self._inbox: queue.Queue[zenoh.Sample | Replies | _Wake] = queue.Queue()
         self._room = threading.Semaphore(INBOX)  # for samples; replies need none, since only so many are asked at once
         self._dialogues: dict[str, Dialogue] = {}  # by source: the gateways that are being asked
         self._turns = Turns()
-        self._held = Held()
-        self._asking = Asking(key, self._progress, self._held)
+        self._held = WaitingResults()
+        self._asking = Dialogues(key, self._progress, self._held)
         self._config = session_config("client", connect=endpoints, tls=tls)
         self._config.insert_json5("connect/timeout_ms", json.dumps(int(CONNECT_S * 1000)))
         self._key, self._endpoints = key, endpoints
@@ -279,7 +279,7 @@ class Consumer:
         self._dialogues[source] = self._asking.dialogue(source)
         yield from self._go_on(source, self._dialogues[source], None)
 
-    def _go_on(self, source: str, dialogue: Dialogue, answer: Answer | None) -> Iterator[Received]:
+    def _go_on(self, source: str, dialogue: Dialogue, answer: GatewayAnswer | None) -> Iterator[Received]:
         """Hand an answer to the dialogue with a gateway, and give its results up to its next question."""
         if self._dialogues.get(source) is not dialogue:
             return

@@ -14,7 +14,7 @@ import os
 import sys
 
 
-class Ending:
+class ProcessEnd:
     """The end of this process. Python calls exit handlers in reverse order, so make this before there are others.
 
     `status`: the exit status, at first that of an uncaught exception.

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from agent.config.known_keys import identifier
 from agent.delivery.history import History
-from agent.delivery.record import Record
+from agent.delivery.record import StoredResult
 from agent.recording.files import recordings
 from agent.recording.result_signing import PUBLIC_KEY, SignedResult
 from agent.recording.results_chain import FILE_METADATA
 from agent.recording.scan import metadata_of
 
 
-def evidence(history: History, shown: Iterable[Record], directory: Path) -> list[str]:
+def evidence(history: History, shown: Iterable[StoredResult], directory: Path) -> list[str]:
     """Sentences on the results in `shown`, which `history` gave, and on those that it refused.
 
     `directory`: the data directory. Of a gateway that signs nothing, there is nothing to say. Raises OSError.
@@ -27,7 +27,7 @@ def evidence(history: History, shown: Iterable[Record], directory: Path) -> list
     return said
 
 
-def signed_with(shown: Iterable[Record]) -> str:
+def signed_with(shown: Iterable[StoredResult]) -> str:
     """The sentence on the keys that signed results which nobody checked with the gateway's key; "" for none."""
     keys = {SignedResult.read(record.signed).public_key for record in shown if record.signed}
     names = " and ".join(sorted(map(identifier, keys)))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import quote
 
 from agent.core.memory import Memory
-from agent.delivery.record import JOINED, Record
+from agent.delivery.record import JOINED, StoredResult
 from agent.delivery.schema import (
     SCHEMA_VERSION,
     DamagedRow,
@@ -29,7 +29,7 @@ from agent.delivery.schema import (
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
 
-__all__ = ["FILE_NAME", "History", "Record", "Removed", "StoreError", "connect_read_only"]
+__all__ = ["FILE_NAME", "History", "Removed", "StoreError", "StoredResult", "connect_read_only"]
 
 FILE_NAME = "state.sqlite"
 _SAYS = "iif(json_valid(CAST(payload AS TEXT)), json_extract(CAST(payload AS TEXT), '$.status'), NULL)"
@@ -57,7 +57,7 @@ class History:
     What is signed is given as it was signed, whatever its row says. With `keys` (those of the gateway), a result that
     none of them signed is left out; without, one whose signature is not valid. `refused`: why, by sequence number, also
     of rows that said something else than was signed. Results without any signature are given, unless `signed_only`:
-    `Record.signed` is empty.
+    `StoredResult.signed` is empty.
     """
 
     def __init__(self, path: Path, keys: KnownKeys | None = None, *, signed_only: bool = False) -> None:
@@ -96,7 +96,7 @@ class History:
         *,
         limit: int,
         epoch: str | None = None,
-    ) -> list[Record]:
+    ) -> list[StoredResult]:
         """The first `limit` results after number `sequence`, in order.
 
         Only of `channels` (sensor, what) and of one `epoch` ("" for results of older versions) where these are given.
@@ -125,7 +125,7 @@ class History:
         """All channels (sensor, what) that have ever had a result."""
         return sorted((sensor, what) for sensor, what, _, _ in self._latest())
 
-    def latest(self) -> list[Record]:
+    def latest(self) -> list[StoredResult]:
         """The newest result of every channel, in order of sequence; a calibration only while it is in force.
 
         With `keys`, the newest one that they signed, once the gateway has signed any.
@@ -137,14 +137,14 @@ class History:
         ]
         return sorted((record for records in found for record in records), key=lambda record: record.sequence)
 
-    def in_force(self, sensor: str) -> Record | None:
+    def in_force(self, sensor: str) -> StoredResult | None:
         """The calibration in force of a sensor; None if it has none, or if a later status was UNCALIBRATED."""
         return next((r for r in self.latest() if r.sensor == sensor and r.what == "calibration"), None)
 
-    def in_force_at(self, sensor: str, times_utc_ns: Sequence[int]) -> list[Record | None]:
+    def in_force_at(self, sensor: str, times_utc_ns: Sequence[int]) -> list[StoredResult | None]:
         """The calibration that was in force at each time, as far as results of that time are kept."""
         rows = self._rows(_IN_FORCE, sensor)
-        starts, found = [row[0] for row in rows], dict[int, Record | None]({-1: None})
+        starts, found = [row[0] for row in rows], dict[int, StoredResult | None]({-1: None})
         ends = [bisect_right(starts, t) - 1 for t in times_utc_ns]
         for k in set(ends) - {-1}:
             _, sequence, calibrates = rows[k]
@@ -164,7 +164,7 @@ class History:
         self.refused |= dict.fromkeys([memory.sequence for memory in memories], f"the kept states: {fault}")
         return []
 
-    def calibrations(self, sensor: str) -> dict[str, Record]:
+    def calibrations(self, sensor: str) -> dict[str, StoredResult]:
         """The newest calibration of each device that a sensor ever had, by identity (kind, serial number, settings)."""
         rows = self._rows(
             "SELECT max(sequence) FROM results WHERE sensor = ? AND what = 'calibration' GROUP BY identity", sensor
@@ -176,7 +176,7 @@ class History:
         rows = self._checked("SELECT name, value, crc FROM marks WHERE name = 'file'")
         return int(rows[0][1]) if rows else 0
 
-    def newest(self, sensor: str, what: str, *, limit: int, run_id: str = "") -> list[Record]:
+    def newest(self, sensor: str, what: str, *, limit: int, run_id: str = "") -> list[StoredResult]:
         """The newest `limit` results of one channel, of one run if it is named, newest first."""
         of_run, named = (" AND run_id = ?", [run_id]) if run_id else ("", [])
         where = f"WHERE sensor = ? AND what = ?{of_run} ORDER BY sequence DESC LIMIT ?"
@@ -200,14 +200,14 @@ class History:
     def _latest(self) -> list[tuple[Any, ...]]:
         return self._checked("SELECT sensor, what, sequence, withdrawn, crc FROM latest")
 
-    def _one(self, sequence: int) -> list[Record]:
+    def _one(self, sequence: int) -> list[StoredResult]:
         """The result with this number; none where it is refused."""
         rows = self._joined("WHERE sequence = ?", sequence)
         if not rows:
             raise StoreError(f"{self._path}: damaged: result {sequence} is missing")
         return self._proven(rows, put_forward=True)
 
-    def _signed_before(self, sensor: str, what: str, sequence: int) -> list[Record]:
+    def _signed_before(self, sensor: str, what: str, sequence: int) -> list[StoredResult]:
         """The newest result of a channel before one that is refused, which may be put forward; none where none may."""
         clause = "WHERE sensor = ? AND what = ? AND sequence < ? ORDER BY sequence DESC LIMIT 1"
         while rows := self._joined(clause, sensor, what, sequence):
@@ -223,10 +223,10 @@ class History:
     def _joined(self, clause: str, *values: object) -> list[tuple[Any, ...]]:
         return self._rows(f"{JOINED} {clause}", *values)
 
-    def _proven(self, rows: list[tuple[Any, ...]], *, put_forward: bool = False) -> list[Record]:
+    def _proven(self, rows: list[tuple[Any, ...]], *, put_forward: bool = False) -> list[StoredResult]:
         """The results in rows of `_joined`, as they were signed; without those that are refused."""
         try:
-            stored = [Record.of_joined(row) for row in rows]
+            stored = [StoredResult.of_joined(row) for row in rows]
         except DamagedRow as error:
             raise StoreError(f"{self._path}: {error}") from None
         must_be = self._signed_only or (put_forward and self._must_be_signed())
@@ -240,7 +240,7 @@ class History:
                 found.append(true)
         return found
 
-    def _as_signed(self, record: Record) -> tuple[Record | None, str]:
+    def _as_signed(self, record: StoredResult) -> tuple[StoredResult | None, str]:
         """The result as it was signed, or None; and why its row is refused."""
         from agent.delivery.proof import UnprovenError, proven
 

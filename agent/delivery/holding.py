@@ -26,7 +26,7 @@ GIVE_UP_S = 300.0  # s without an answer, after which results are given although
 
 
 @dataclass
-class _Waiting:
+class _WaitingResult:
     answers: bool  # it answered the last time, or results of it are known
     due_s: float  # monotonic time from which the gateway may be asked (again)
     results: deque[Received] = field(default_factory=lambda: deque(maxlen=RESULTS_MAX))
@@ -36,12 +36,12 @@ class _Waiting:
     silent_since_s: float | None = None  # time of the first query that was not answered
 
 
-class Held:
+class WaitingResults:
     """The results that wait, by gateway (`<site>/<gateway>`). `dropped`: how many were not kept, by gateway."""
 
     def __init__(self) -> None:
         self.dropped: Counter[str] = Counter()
-        self._waiting: dict[str, _Waiting] = {}
+        self._waiting: dict[str, _WaitingResult] = {}
         self._asking: dict[str, bool] = {}  # the gateways that are being asked, and whether they answered the last time
         # All others that wait, by the time from which they may be asked, apart by whether they answered the last time.
         self._next: dict[bool, list[tuple[float, str]]] = {True: [], False: []}
@@ -67,9 +67,9 @@ class Held:
         """The number of gateways for which `look` may be called now."""
         return LOOKS_MAX - self._looks
 
-    def _of(self, source: str, known: bool) -> _Waiting:
+    def _of(self, source: str, known: bool) -> _WaitingResult:
         if source not in self._waiting:
-            self._waiting[source] = _Waiting(known, time.monotonic())
+            self._waiting[source] = _WaitingResult(known, time.monotonic())
             self._queue(source)
         return self._waiting[source]
 

@@ -12,7 +12,7 @@ import json
 from typing import Any
 
 from agent import __version__
-from agent.delivery.record import Record
+from agent.delivery.record import StoredResult
 from calib.model import PARAMETERS
 
 STATUSES = ["UNCALIBRATED", "COLLECTING", "VALID", "HELD", "RECALIBRATING", "INVALID"]
@@ -30,7 +30,7 @@ def entities_of_gateway(prefix: str, topic: str, site: str, gateway: str) -> dic
     return dict([_entity(prefix, topic, device, "binary_sensor", "problem", problem)])
 
 
-def entities_of_sensor(prefix: str, topic: str, site: str, gateway: str, calibration: Record) -> dict[str, bytes]:
+def entities_of_sensor(prefix: str, topic: str, site: str, gateway: str, calibration: StoredResult) -> dict[str, bytes]:
     """Messages by topic: status, date, S, Q and U of the calibration in force, and the drift verdict on each parameter.
 
     `topic`: of the gateway. The units are those of the calibration. Raises StoreError where it cannot be read.

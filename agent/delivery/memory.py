@@ -20,12 +20,12 @@ class MemoryFileError(Exception):
     """The memory file cannot be read or is damaged. The message names the file."""
 
 
-class _Content(msgspec.Struct, forbid_unknown_fields=True):
+class _MemoryFile(msgspec.Struct, forbid_unknown_fields=True):
     last_sequence: dict[str, int]
     crc32: int  # of last_sequence; without it, a changed digit would skip results unnoticed
 
 
-class Memory:
+class ProcessedNumbers:
     """`numbers`: of the last result that was processed, by gateway; kept in a file where there is a `path`.
 
     Raises MemoryFileError where the file cannot be read; the methods raise OSError where it cannot be written.
@@ -52,7 +52,7 @@ class Memory:
 def load(path: Path) -> dict[str, int]:
     """Read the last sequence number by `<site>/<gateway>`; empty where there is no file. Raises MemoryFileError."""
     try:
-        content = msgspec.json.decode(read_file(path, SIZE_MAX), type=_Content)
+        content = msgspec.json.decode(read_file(path, SIZE_MAX), type=_MemoryFile)
     except FileNotFoundError:
         return {}
     except OSError as error:
@@ -71,7 +71,7 @@ def save(path: Path, last_sequence: Mapping[str, int]) -> None:
     kept = dict(last_sequence)
     new = path.with_name(path.name + ".new")
     with open(new, "wb") as file:
-        file.write(msgspec.json.encode(_Content(kept, _crc32(kept))))
+        file.write(msgspec.json.encode(_MemoryFile(kept, _crc32(kept))))
         file.flush()
         os.fsync(file.fileno())
     new.replace(path)

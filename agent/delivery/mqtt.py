@@ -19,7 +19,7 @@ import msgspec
 
 from agent.config import Mqtt
 from agent.config.broker import read_password, tls_context
-from agent.delivery.history import History, Record, StoreError
+from agent.delivery.history import History, StoredResult, StoreError
 from agent.delivery.home_assistant import entities_of_gateway, entities_of_sensor
 from hw.vendor_library import vendor_library
 
@@ -112,7 +112,7 @@ class MqttPublisher:
         """Start publishing in a thread of its own."""
         self._thread.start()
 
-    def publish(self, record: Record) -> None:
+    def publish(self, record: StoredResult) -> None:
         """Publish a result, in place of an earlier one of its topic."""
         self._put_all(self._values(record))
 
@@ -152,7 +152,7 @@ class MqttPublisher:
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    def _values(self, record: Record) -> dict[str, bytes]:
+    def _values(self, record: StoredResult) -> dict[str, bytes]:
         """What a result publishes, by topic. An empty value lets the broker forget the one that it retains."""
         end = {"drift": "parameter", "clock": "device"}.get(record.what)
         parts = [self._topic, record.sensor, record.what, str(record.fields.get(end, "")) if end else ""]

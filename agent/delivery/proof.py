@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from agent.delivery.record import Record
+from agent.delivery.record import StoredResult
 from agent.delivery.schema import StoreError
 from agent.delivery.verifying import differing
 from agent.recording.messages import MessageError, topic_of
@@ -20,7 +20,7 @@ class UnprovenError(Exception):
     """A result in the store is not what the gateway signed. The message says why."""
 
 
-def proven(record: Record, keys: KnownKeys | None) -> tuple[Record, str]:
+def proven(record: StoredResult, keys: KnownKeys | None) -> tuple[StoredResult, str]:
     """(the record as its signed bytes say it, in what the stored row differs from them; "" where it does not).
 
     `recorded` and `recording` are not signed and stay. With `keys`, one of them must have signed; without, the key
@@ -40,7 +40,7 @@ def proven(record: Record, keys: KnownKeys | None) -> tuple[Record, str]:
         return record, ""
     if (result.sequence, topic_of(result)) != (signed.sequence, place):
         raise UnprovenError(f"it is signed as another result: {result.sequence} ({topic_of(result)!r:.140})")
-    made = Record.of(
+    made = StoredResult.of(
         result, recorded=record.recorded, recording=record.recording, epoch=signed.epoch, signed=record.signed
     )
     names = list(_differing(record, made))
@@ -49,7 +49,7 @@ def proven(record: Record, keys: KnownKeys | None) -> tuple[Record, str]:
     return made, f"its row says something else than what was signed: {', '.join(names)}" if names else ""
 
 
-def _differing(record: Record, made: Record) -> tuple[str, ...]:
+def _differing(record: StoredResult, made: StoredResult) -> tuple[str, ...]:
     try:
         return differing(record.fields, made.fields)
     except StoreError:  # no JSON

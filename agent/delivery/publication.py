@@ -19,7 +19,7 @@ from zenoh.ext import AdvancedPublisher, CacheConfig, MissDetectionConfig, decla
 from agent.config.tls import TlsFiles, expiry_warning
 from agent.delivery.answers import answer_queries, attachment_of
 from agent.delivery.hearing import Hearing
-from agent.delivery.history import History, Record, StoreError
+from agent.delivery.history import History, StoredResult, StoreError
 from agent.delivery.instances import watch_own_name
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import session_config
@@ -95,7 +95,7 @@ class Publisher:
         self._serve_more = serve
         self._instance, self._looks = instance or uuid.uuid4().hex, bool(instance)
         self._store = store
-        self._recent: deque[Record] = deque(maxlen=RECENT_MAX)
+        self._recent: deque[StoredResult] = deque(maxlen=RECENT_MAX)
         self._blocks: deque[tuple[str, bytes]] = deque(maxlen=BLOCKS_MAX)
         self._wake = threading.Event()
         self._stop = threading.Event()
@@ -118,7 +118,7 @@ class Publisher:
         atexit.register(self.close)
         self._thread.start()
 
-    def publish(self, record: Record) -> None:
+    def publish(self, record: StoredResult) -> None:
         """Publish a result in its order. Call it after the commit, also after one that failed. Returns at once."""
         self._recent.append(record)
         self._wake.set()
@@ -262,7 +262,7 @@ class Publisher:
                 congestion_control=zenoh.CongestionControl.DROP,
             )
 
-    def _put(self, session: zenoh.Session, record: Record, previous: int) -> None:
+    def _put(self, session: zenoh.Session, record: StoredResult, previous: int) -> None:
         key = result_key(self._key, record.sensor, record.what)
         attachment = attachment_of(record, str(previous))
         self._publisher(session, key, cached=CACHE_SAMPLES).put(record.payload, attachment=attachment)

@@ -16,7 +16,7 @@ ANSWER_S = 5.0  # s that one question waits for its answer
 REPLIES_MAX, BYTES_MAX = 2000, 16 << 20  # of one answer; a gateway gives 500 results, about 2 MB
 
 
-class Answer(NamedTuple):
+class GatewayAnswer(NamedTuple):
     """What a gateway answered. `results`: in order. `removed`: number up to which it has deleted results, or 0.
 
     `reached`: the highest number in the answer, also of results that were refused; 0 where there is none.
@@ -29,10 +29,10 @@ class Answer(NamedTuple):
 
 
 # Gives results and asks questions (selectors), in this order; what is sent to it is the answer to its last question.
-Dialogue = Generator[Received | str, Answer, None]
+Dialogue = Generator[Received | str, GatewayAnswer, None]
 
 
-def steps(dialogue: Dialogue, answer: Answer | None) -> Iterator[Received | str]:
+def steps(dialogue: Dialogue, answer: GatewayAnswer | None) -> Iterator[Received | str]:
     """What a dialogue gives after `answer` (None: at its beginning), up to its next question or its end."""
     try:
         step = next(dialogue) if answer is None else dialogue.send(answer)
@@ -101,7 +101,7 @@ class Questions:
 
 def answer_of(
     replies: Sequence[zenoh.Reply] | None, received: Callable[[zenoh.Sample], tuple[Received | None, int]]
-) -> Answer:
+) -> GatewayAnswer:
     """What these replies say. `received` gives the result in a sample, or None, and its number, otherwise 0."""
     answered, removed, reached = False, 0, 0
     results = []
@@ -114,7 +114,7 @@ def answer_of(
         removed = max(removed, gone)
         answered |= reply.err is None or gone > 0 or reply.err.payload.to_bytes() == NOTHING
     in_order = sorted((r for r in results if r is not None), key=lambda r: r.sequence)
-    return Answer(in_order, answered, removed, reached)
+    return GatewayAnswer(in_order, answered, removed, reached)
 
 
 def _removed(error: zenoh.ReplyError) -> int:

@@ -11,12 +11,12 @@ import msgspec
 from agent.core.events import RESULTS, CalibrationUpdate, Result
 from agent.delivery.schema import RESULT_COLUMNS, StoreError, checked, row_crc
 
-# Reads the rows for `Record.of_joined`; conditions may follow.
+# Reads the rows for `StoredResult.of_joined`; conditions may follow.
 JOINED = f"SELECT {RESULT_COLUMNS}, crc, data, signed_crc FROM results LEFT JOIN signed USING (sequence)"
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class StoredResult:
     """A result as it is stored and published.
 
     `payload`: its JSON with two added fields: `recorded`, which is false where the result and its raw data are in no
@@ -37,10 +37,10 @@ class Record:
     signed: bytes = b""
 
     @staticmethod
-    def of(result: Result, *, recorded: bool, recording: str, epoch: str = "", signed: bytes = b"") -> Record:
+    def of(result: Result, *, recorded: bool, recording: str, epoch: str = "", signed: bytes = b"") -> StoredResult:
         """Make the record of a result."""
         identity = result.identity if isinstance(result, CalibrationUpdate) else ""
-        return Record(
+        return StoredResult(
             result.sequence,
             result.run_id,
             result.sensor,
@@ -54,17 +54,19 @@ class Record:
         )
 
     @staticmethod
-    def of_row(row: tuple[Any, ...], signed: bytes = b"") -> Record:
+    def of_row(row: tuple[Any, ...], signed: bytes = b"") -> StoredResult:
         """Make the record from a row: RESULT_COLUMNS and their CRC. Raises DamagedRow."""
         sequence, run_id, sensor, what, payload, t_utc_ns, recorded, recording, identity = checked(row)
-        return Record(sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity, signed)
+        return StoredResult(
+            sequence, run_id, sensor, what, payload, t_utc_ns, bool(recorded), recording, identity, signed
+        )
 
     @staticmethod
-    def of_joined(row: tuple[Any, ...]) -> Record:
+    def of_joined(row: tuple[Any, ...]) -> StoredResult:
         """Make the record from a row of JOINED. Raises DamagedRow."""
         *columns, data, signed_crc = row
         signed = bytes(checked((row[0], data, signed_crc))[1]) if data is not None else b""
-        return Record.of_row(tuple(columns), signed)
+        return StoredResult.of_row(tuple(columns), signed)
 
     @property
     def row(self) -> tuple[Any, ...]:

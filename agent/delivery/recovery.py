@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from agent.delivery.gateway_key import GatewayKey
 from agent.delivery.proof import UnprovenError, proven
-from agent.delivery.record import JOINED, Record
+from agent.delivery.record import JOINED, StoredResult
 from agent.delivery.schema import (
     RESULT_COLUMNS,
     checked,
@@ -82,7 +82,7 @@ def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | N
     return recovered
 
 
-def records_of(path: Path, found: ScannedFile) -> list[Record]:
+def records_of(path: Path, found: ScannedFile) -> list[StoredResult]:
     """The results of a scanned recording, with their signatures, which are not verified."""
     origin = found.metadata.get(FILE_METADATA, {})
     start = first_event(path) if PUBLIC_KEY in origin else None
@@ -92,12 +92,12 @@ def records_of(path: Path, found: ScannedFile) -> list[Record]:
         signed = recorded_result(result, message, gateway, origin) if start is not None else None
         data = signed.data if signed is not None and signed.is_written else b""
         records.append(
-            Record.of(result, recorded=True, recording=final_name(path), epoch=origin.get(EPOCH, ""), signed=data)
+            StoredResult.of(result, recorded=True, recording=final_name(path), epoch=origin.get(EPOCH, ""), signed=data)
         )
     return records
 
 
-def find_recorded(directory: Path, name: str, sequence: int, key: GatewayKey) -> Record | None:
+def find_recorded(directory: Path, name: str, sequence: int, key: GatewayKey) -> StoredResult | None:
     """A result in the recordings, first looked for in the one with this name; None where there is none within LOOK_S.
 
     The key must have signed it, or a recording that names the SHA-256 of its recording. Raises OSError.
@@ -135,7 +135,7 @@ def check_row(connection: sqlite3.Connection, directory: Path, sequence: int, ke
     Returns what is told of it; "" where the row is right, or is unsigned and the same as in the recordings. Raises
     sqlite3.Error, DamagedRow, OSError.
     """
-    record = Record.of_joined(connection.execute(f"{JOINED} WHERE sequence = ?", (sequence,)).fetchone())
+    record = StoredResult.of_joined(connection.execute(f"{JOINED} WHERE sequence = ?", (sequence,)).fetchone())
     right, reason = None, "it is not signed"
     if record.signed:
         try:
@@ -157,7 +157,7 @@ def check_row(connection: sqlite3.Connection, directory: Path, sequence: int, ke
     return f"{told}; it was made anew from what is signed: send a command that names it again"
 
 
-def _counts(path: Path, record: Record, keys: KnownKeys | None) -> bool:
+def _counts(path: Path, record: StoredResult, keys: KnownKeys | None) -> bool:
     """Whether a result of a recording may be in the store."""
     if keys is None or not record.signed:
         return True
@@ -182,12 +182,12 @@ def name_latest(connection: sqlite3.Connection) -> None:
             calibrations[sensor] = sequence
     since = f"SELECT {RESULT_COLUMNS}, crc FROM results WHERE sensor = ? AND what = 'status' AND sequence > ?"
     for sensor, sequence in calibrations.items():
-        statuses = map(Record.of_row, connection.execute(since, (sensor, sequence)))
+        statuses = map(StoredResult.of_row, connection.execute(since, (sensor, sequence)))
         if (sensor, sequence) in withdrawn or any(status.is_withdrawal for status in statuses):
             withdraw(connection, sensor)
 
 
-def _missing(connection: sqlite3.Connection, records: Iterable[Record]) -> list[Record]:
+def _missing(connection: sqlite3.Connection, records: Iterable[StoredResult]) -> list[StoredResult]:
     missing = []
     for record in records:
         row = connection.execute("SELECT 1 FROM results WHERE sequence = ?", (record.sequence,)).fetchone()

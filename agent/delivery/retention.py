@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.schema import checked, row_crc
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def keep_results(section: Results) -> KeepResults:
 
 
 @dataclass(frozen=True, slots=True)
-class _Result:
+class _OldResult:
     sequence: int
     sensor: str
     what: str
@@ -57,9 +57,9 @@ class Sweep:
     def __init__(self, keep: KeepResults) -> None:
         self._keep = keep
         self._looked_at = 0  # up to this number only results that must be kept are left
-        self._staying: list[_Result] = []  # old results kept because each was the newest of its channel or device
+        self._staying: list[_OldResult] = []  # old results kept because each was the newest of its channel or device
 
-    def run(self, connection: sqlite3.Connection, new: Sequence[Record], published: int) -> None:
+    def run(self, connection: sqlite3.Connection, new: Sequence[StoredResult], published: int) -> None:
         """Delete the oldest results, FOR_EACH_NEW at most for each of `new`. `published`: the last published result.
 
         Raises sqlite3.Error, DamagedRow.
@@ -74,7 +74,7 @@ class Sweep:
             (self._looked_at, FOR_EACH_NEW * len(new)),
         ).fetchall()
         for row in rows:
-            result = _Result(*row)
+            result = _OldResult(*row)
             age_days = (now_ns - result.t_utc_ns) / DAY_NS
             done = result.sequence <= published and (too_large or _beyond(age_days, self._keep.days))
             if not done and not _beyond(age_days, self._keep.waiting_days):
@@ -97,7 +97,7 @@ def _beyond(age_days: float, limit_days: float | None) -> bool:
     return limit_days is not None and age_days > limit_days
 
 
-def _delete(connection: sqlite3.Connection, result: _Result) -> bool:
+def _delete(connection: sqlite3.Connection, result: _OldResult) -> bool:
     """Delete a result and return True; False where it must be kept.
 
     Kept are the newest result of each channel and the newest calibration of each device.

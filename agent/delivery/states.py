@@ -18,7 +18,7 @@ from agent.core.events import CalibrationUpdate
 from agent.core.memory import Memory
 from agent.delivery.gateway_key import GatewayKey
 from agent.delivery.proof import UnprovenError, proven
-from agent.delivery.record import JOINED, Record
+from agent.delivery.record import JOINED, StoredResult
 from agent.delivery.schema import read_memories, read_states
 from agent.delivery.signed_states import StateList
 from agent.recording.files import file_number, final_name, recordings
@@ -215,7 +215,7 @@ def _begin_from_calibrations(connection: sqlite3.Connection, key: GatewayKey, st
 
     done: set[tuple[str, str]] = set()
     for row in connection.execute(f"{JOINED} WHERE what = 'calibration' ORDER BY sequence DESC"):
-        record = Record.of_joined(row)
+        record = StoredResult.of_joined(row)
         device = (record.sensor, record.identity)
         if device in done or states.known(*device) >= record.sequence or not record.signed:
             continue

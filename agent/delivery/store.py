@@ -15,7 +15,7 @@ from agent.core.memory import Memory
 from agent.delivery.gateway_key import GatewayKey
 from agent.delivery.history import FILE_NAME, History
 from agent.delivery.opening import lock, open_or_set_aside
-from agent.delivery.record import Record
+from agent.delivery.record import StoredResult
 from agent.delivery.recovery import Recovered, check_newest, check_row, name_latest, recover
 from agent.delivery.retention import FOR_EVER, KeepResults, Sweep
 from agent.delivery.schema import (
@@ -75,7 +75,7 @@ class Store:
         first = time.time_ns() // 1_000_000 if count_from is None else count_from
         self.path = data_dir / FILE_NAME
         self._mutex = threading.Lock()
-        self._waiting: list[Record] = []
+        self._waiting: list[StoredResult] = []
         self._memories: dict[tuple[str, str], Memory] = {}
         self._key = key
         self._digests: Digests = {}
@@ -98,7 +98,7 @@ class Store:
         """The highest sequence number used; the next result must have a higher one."""
         return self._last
 
-    def commit(self, records: Iterable[Record], memories: Iterable[Memory] = ()) -> None:
+    def commit(self, records: Iterable[StoredResult], memories: Iterable[Memory] = ()) -> None:
         """Write results and states in one transaction; when this returns they survive a power cut.
 
         Raises StoreError where they cannot be written (the next commit tries again), or where a result's number is not
@@ -122,7 +122,7 @@ class Store:
         """Open a reader that gives only what the gateway's key signed. Use it in one thread. Raises StoreError."""
         return History(self.path, self._key.known if self._key is not None else None)
 
-    def find(self, sensor: str, what: str, sequence: int) -> Record | None:
+    def find(self, sensor: str, what: str, sequence: int) -> StoredResult | None:
         """A result that is to come into force, as the gateway's key signed it; None where there is none.
 
         Raises StoreError where it is not what the key signed, or cannot be read. If the recordings have it, its row is
@@ -217,14 +217,14 @@ class Store:
                 os.close(self._lock)
                 self._lock = -1
 
-    def _enqueue(self, records: Iterable[Record]) -> None:
+    def _enqueue(self, records: Iterable[StoredResult]) -> None:
         for record in records:
             if record.sequence <= self._last:
                 raise StoreError(f"{self.path}: result {record.sequence} does not come after result {self._last}")
             self._waiting.append(record)
             self._last = record.sequence
 
-    def _write(self, records: list[Record]) -> None:
+    def _write(self, records: list[StoredResult]) -> None:
         insert_results(self._connection, [record.row for record in records])
         insert_signed(self._connection, [(record.sequence, record.signed) for record in records if record.signed])
         for record in records:

@@ -43,7 +43,7 @@ class EngineResults(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ProcessLimits:
     """What the process of an engine may use."""
 
     memory_bytes: int = 1536 << 20  # address space; numpy and scipy take 0.4 GB of it
@@ -58,9 +58,9 @@ class EngineProcess:
     Each takes and gives messages as a recording holds them: the full name of the schema, and the bytes.
     """
 
-    def __init__(self, wheel: EngineWheel, limits: Limits | None = None) -> None:
+    def __init__(self, wheel: EngineWheel, limits: ProcessLimits | None = None) -> None:
         self._wheel = wheel
-        self._limits = limits or Limits()
+        self._limits = limits or ProcessLimits()
         self._ends_at = time.monotonic() + self._limits.whole_s
         self._said = b""  # by the engine, on standard error
 

@@ -48,7 +48,7 @@ float64[] effort
 _NOT_MEASURED = (-1.0, *[0.0] * 8)  # the covariance that says so, in the words of ROS
 
 
-class _Cdr:
+class _CdrWriter:
     """A message that grows; numbers are aligned to their size from the end of the four first bytes."""
 
     def __init__(self, t_utc_ns: int, frame: str) -> None:
@@ -79,7 +79,7 @@ class _Cdr:
 
 def imu(t_utc_ns: int, frame: str, acceleration: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> bytes:
     """An acceleration (3,) in m/s2. Orientation and angular velocity are marked as not measured, as ROS does it."""
-    cdr = _Cdr(t_utc_ns, frame)
+    cdr = _CdrWriter(t_utc_ns, frame)
     cdr.put("d", 0.0, 0.0, 0.0, 1.0, *_NOT_MEASURED)
     cdr.put("d", 0.0, 0.0, 0.0, *_NOT_MEASURED)
     cdr.put("d", *acceleration.tolist(), *[0.0] * 9)  # covariance 0: not known
@@ -88,7 +88,7 @@ def imu(t_utc_ns: int, frame: str, acceleration: np.ndarray[tuple[int, ...], np.
 
 def joint_state(t_utc_ns: int, frame: str, names: Sequence[str], values: Sequence[float]) -> bytes:
     """Named numbers, as `position`."""
-    cdr = _Cdr(t_utc_ns, frame)
+    cdr = _CdrWriter(t_utc_ns, frame)
     cdr.put("I", len(names))
     for name in names:
         cdr.text(name)

@@ -25,7 +25,7 @@ from calib.model import PARAMETERS, Array
 from calib.output_unit import shown_in
 from calib.rounding import aligned, plus_minus, rounded
 from calib.state.dating import PROBABILITY, Date
-from calib.state.past import Change
+from calib.state.past import StatedChange
 
 DATED = ("change", "u_change_days", "change_after", "change_before")  # columns of CSV
 SHOWN = ("Sxx", "Syy", "Szz", "Qx", "Qy", "Qz")
@@ -226,7 +226,7 @@ def lines(one: SensorPast) -> Iterator[str]:
         yield f"{date_of(known.utc_ns(change.day))}  {_words(change, shown.factors, k)}; {_when(known, date)}"
 
 
-def _words(change: Change, factors: Array, k: float) -> str:
+def _words(change: StatedChange, factors: Array, k: float) -> str:
     """What may have changed at once on a day, and by how much S and Q did."""
     values, U = (factors * change.found).tolist(), (factors * k * change.standard_uncertainty).tolist()
     told = zip(PARAMETERS, values, U, strict=True)

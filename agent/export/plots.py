@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from agent import __version__
 from agent.core.events import CalibrationUpdate
 from agent.export.cdr import DEFINITIONS, IMU, JOINT_STATE, imu, joint_state
-from agent.export.samples import Content, Samples, new_file
+from agent.export.samples import ExportedSamples, RecordedContent, new_file
 from calib.model import PARAMETERS, Array
 
 AXES = ("x", "y", "z")
@@ -19,7 +19,7 @@ CHUNK_BYTES = 1 << 18
 NAMES = (*PARAMETERS, *(f"U_{name}" for name in PARAMETERS))
 
 
-def write_plots(path: Path, content: Content, blocks: Iterable[Samples], rate_hz: float) -> int:
+def write_plots(path: Path, content: RecordedContent, blocks: Iterable[ExportedSamples], rate_hz: float) -> int:
     """Write the topics; each message is the mean of the samples in an interval of 1 / `rate_hz`. Gives their number.
 
     Raises OSError, also where the file exists.
@@ -52,7 +52,7 @@ def write_plots(path: Path, content: Content, blocks: Iterable[Samples], rate_hz
     return count
 
 
-def means(blocks: Iterable[Samples], rate_hz: float) -> Iterator[tuple[int, Array]]:
+def means(blocks: Iterable[ExportedSamples], rate_hz: float) -> Iterator[tuple[int, Array]]:
     """Mean time in ns and mean values (axes + 3,) of each interval, counted from 1970: indications, then accelerations.
 
     Without a calibration there are indications alone.

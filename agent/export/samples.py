@@ -21,7 +21,7 @@ from agent.core.kept import update_of
 from agent.core.snapshot import unpack
 from agent.core.stream import UNCOUNTED, DeviceStream
 from agent.export.smoothing import Smoothed
-from agent.recording.reading import RecordingReader, Step, first_event
+from agent.recording.reading import RecordedStep, RecordingReader, first_event
 from calib.model import Array
 from hw.block import SampleBlock
 
@@ -33,7 +33,7 @@ class ExportError(Exception):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class ExportedSamples:
     """Consecutive samples of one device: `t_utc_ns` (n,) by its clock, `values` (n, axes) in `unit`.
 
     `acceleration` (n, 3) in m/s2, None without a calibration. `first_index`: number of the first sample in the device's
@@ -51,7 +51,7 @@ class Samples:
 
 
 @dataclass(slots=True)
-class Content:
+class RecordedContent:
     """What recordings have of one device: `calibrations` in order of time, the first may be older than the files.
 
     `smoothed`: the past by which its samples are corrected, if that was asked for. `left_out`: how many samples get no
@@ -92,12 +92,12 @@ def followed(path: Path) -> Iterator[None]:
         ) from None
 
 
-def content_of(paths: Sequence[Path], device: str | None) -> Content:
+def content_of(paths: Sequence[Path], device: str | None) -> RecordedContent:
     """Look through the recordings for the device; without a name, for the only sensor. Raises ExportError."""
     names = list(dict.fromkeys(sensor for path in paths for sensor in sensors_of(path)))
     if device is None and len(names) != 1:
         raise ExportError(f"{paths[0]}: has the sensors {', '.join(names)}; choose one with --device")
-    found = Content(device or names[0])
+    found = RecordedContent(device or names[0])
     for path in paths:
         with followed(path):
             for step in steps_of(path, found.faults):
@@ -107,7 +107,7 @@ def content_of(paths: Sequence[Path], device: str | None) -> Content:
     return found
 
 
-def samples(paths: Sequence[Path], content: Content) -> Iterator[Samples]:
+def samples(paths: Sequence[Path], content: RecordedContent) -> Iterator[ExportedSamples]:
     """The samples of the device in order. A block whose samples get no time from the clock is left out.
 
     Raises ExportError, also where S and Q smoothed over the past are asked for and correct no sample.
@@ -121,7 +121,7 @@ def samples(paths: Sequence[Path], content: Content) -> Iterator[Samples]:
         raise ExportError(f"{content.device}: no sample can be corrected: {'; '.join(content.left_out)}")
 
 
-def _of_file(path: Path, content: Content) -> Iterator[Samples]:
+def _of_file(path: Path, content: RecordedContent) -> Iterator[ExportedSamples]:
     start = start_of(path)
     with followed(path):
         clocked = _Clocked(start, content)
@@ -148,7 +148,7 @@ def acceleration(values: Array, calibration: CalibrationUpdate, degc: float | No
 
 
 @dataclass(frozen=True, slots=True)
-class _Waiting:
+class _WaitingBlock:
     """A block that waits for its clock, with the device that sent it and the calibration that was in force then."""
 
     block: SampleBlock
@@ -159,9 +159,9 @@ class _Waiting:
 class _Clocked:
     """The clock of one device in one file, and the blocks that wait for it."""
 
-    def __init__(self, start: RunStart, content: Content) -> None:
+    def __init__(self, start: RunStart, content: RecordedContent) -> None:
         self._content = content
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[_WaitingBlock] = deque()
         self._stream, origin_ns = _stream(start, content.device)
         self._origin_utc_ns = start.t_utc_ns - start.t_monotonic_ns + origin_ns
         channel = unpack(start.snapshot)["channels"].get(content.device, {})
@@ -169,7 +169,7 @@ class _Clocked:
         self._identity, self._device = channel.get("identity", ""), channel.get("device", "")
         self._calibration = 0 if in_force is None else in_force.made[1]
 
-    def update(self, step: Step) -> Iterator[Samples]:
+    def update(self, step: RecordedStep) -> Iterator[ExportedSamples]:
         """Take the next event; yield the blocks that have waited long enough."""
         event, name = step.event, self._content.device
         if isinstance(event, DeviceChange) and event.device == name and event.info_json:
@@ -184,11 +184,11 @@ class _Clocked:
             elif isinstance(result, StatusChange) and result.sensor == name and result.status == "UNCALIBRATED":
                 self._calibration = 0
 
-    def _take(self, block: SampleBlock) -> Iterator[Samples]:
+    def _take(self, block: SampleBlock) -> Iterator[ExportedSamples]:
         if block.flags & UNCOUNTED:
             yield from self.rest()
         self._stream.update(block)
-        self._waiting.append(_Waiting(block, self._device, self._calibration))
+        self._waiting.append(_WaitingBlock(block, self._device, self._calibration))
         newest_ns = block.t_monotonic_ns
         while newest_ns - self._waiting[0].block.t_monotonic_ns > DELAY_S * 1e9:
             yield from self._timed(self._waiting.popleft())
@@ -196,12 +196,12 @@ class _Clocked:
         if newest_s is not None:
             self._stream.forget_before(newest_s - DELAY_S)
 
-    def rest(self) -> Iterator[Samples]:
+    def rest(self) -> Iterator[ExportedSamples]:
         """Yield all that still wait."""
         while self._waiting:
             yield from self._timed(self._waiting.popleft())
 
-    def _timed(self, waiting: _Waiting) -> Iterator[Samples]:
+    def _timed(self, waiting: _WaitingBlock) -> Iterator[ExportedSamples]:
         told, block, content = self._stream.clock(), waiting.block, self._content
         if told is None:
             return
@@ -221,7 +221,7 @@ class _Clocked:
                 content.left_out[why] += block.n
         elif content.calibrations and values.shape[1] == 3:
             a = acceleration(values, content.calibrations[-1], degc)
-        yield Samples(t_utc_ns, values, a, block.first_index, clock.rate_hz, degc, waiting.calibration)
+        yield ExportedSamples(t_utc_ns, values, a, block.first_index, clock.rate_hz, degc, waiting.calibration)
 
 
 def _stream(start: RunStart, device: str) -> tuple[DeviceStream, int]:
@@ -234,7 +234,7 @@ def _stream(start: RunStart, device: str) -> tuple[DeviceStream, int]:
     return DeviceStream(device, start.t_monotonic_ns), start.t_monotonic_ns
 
 
-def _look(step: Step, found: Content) -> None:
+def _look(step: RecordedStep, found: RecordedContent) -> None:
     event = step.event
     if isinstance(event, RunStart):
         held = unpack(event.snapshot)["channels"].get(found.device)
@@ -248,7 +248,7 @@ def _look(step: Step, found: Content) -> None:
     found.calibrations += [r for r in step.results if isinstance(r, CalibrationUpdate) and r.sensor == found.device]
 
 
-def steps_of(path: Path, faults: list[str]) -> Iterator[Step]:
+def steps_of(path: Path, faults: list[str]) -> Iterator[RecordedStep]:
     """Yield the steps of a file; why it ends early is added to `faults`. Raises ExportError for a damaged one."""
     reader = RecordingReader(path)
     try:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.export.samples import Content, ExportError, Samples, new_file
+from agent.export.samples import ExportedSamples, ExportError, RecordedContent, new_file
 from agent.export.tables import columns
 
 NETWORK = "XX"  # of the FDSN: for data that belong to no registered network
@@ -18,7 +18,7 @@ INDICATION, ACCELERATION = "00", "10"  # location codes
 BANDS = ((1000.0, "F"), (250.0, "C"), (80.0, "H"), (10.0, "B"), (1.0, "M"), (0.0, "L"))
 
 
-def write_mseed(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+def write_mseed(path: Path, content: RecordedContent, blocks: Iterable[ExportedSamples]) -> int:
     """Write a channel for each axis: indications at location 00, accelerations in m/s2 at location 10.
 
     Each block begins with its own time; the rate is that of the first block. Raises ExportError without ObsPy.
@@ -50,7 +50,7 @@ def write_mseed(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
     return rows
 
 
-def rate_of(block: Samples) -> float:
+def rate_of(block: ExportedSamples) -> float:
     """The rate in Hz, as precise as a record of MiniSEED has it."""
     return float(np.float32(block.rate_hz))
 

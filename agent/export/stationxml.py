@@ -19,7 +19,7 @@ import numpy as np
 
 from agent import __version__
 from agent.export.past import Made, SensorPast
-from agent.export.samples import Content, ExportError, new_file
+from agent.export.samples import ExportError, RecordedContent, new_file
 from agent.export.seismic import INDICATION, NETWORK, channel_code, station_code
 from agent.export.smoothing import smoothing
 from agent.terminal.text import one_line
@@ -36,7 +36,7 @@ NO_XML = str.maketrans("", "", "\ufffe\uffff")  # characters that XML does not a
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class StationPlace:
     """Where the station is: latitude and longitude in degrees, elevation in m."""
 
     latitude_deg: float
@@ -59,7 +59,7 @@ class _Epoch:
 
 
 def write_stationxml(
-    path: Path, content: Content, found: Sequence[SensorPast], *, site: str, rate_hz: float, place: Place
+    path: Path, content: RecordedContent, found: Sequence[SensorPast], *, site: str, rate_hz: float, place: StationPlace
 ) -> int:
     """Write a channel for each axis and each epoch of the past of a sensor; `found`: that of its devices. Returns how
     many epochs there are. Raises ExportError where there are none, OSError.
@@ -121,7 +121,7 @@ def _timed(epochs: Sequence[_Epoch]) -> list[_Epoch]:
     return [epoch for epoch in timed if epoch.start_us != epoch.end_us]
 
 
-def _channel(station: ET.Element, axis: int, epoch: _Epoch, unit: str, rate_hz: float, place: Place) -> None:
+def _channel(station: ET.Element, axis: int, epoch: _Epoch, unit: str, rate_hz: float, place: StationPlace) -> None:
     ends = {} if epoch.end_us is None else {"endDate": _time(epoch.end_us)}
     channel = _add(
         station, "Channel", code=channel_code(rate_hz, axis), startDate=_time(epoch.start_us), **ends,
@@ -187,7 +187,7 @@ def _gain(of: ET.Element, S: float, at_hz: float) -> None:
     _add(of, "Frequency", repr(at_hz))
 
 
-def _placed(of: ET.Element, place: Place) -> None:
+def _placed(of: ET.Element, place: StationPlace) -> None:
     _add(of, "Latitude", repr(place.latitude_deg))
     _add(of, "Longitude", repr(place.longitude_deg))
     _add(of, "Elevation", repr(place.elevation_m))

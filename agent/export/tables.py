@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.export.samples import Content, ExportError, Samples, new_file
+from agent.export.samples import ExportedSamples, ExportError, RecordedContent, new_file
 from agent.terminal.text import no_formula, one_line
 from calib.model import Array
 
 QUANTITIES = {"m/s2": "a", "m/s": "v", "m": "d"}  # name of the column of a uniaxial device, by its unit
 
 
-def names_of(content: Content) -> list[str]:
+def names_of(content: RecordedContent) -> list[str]:
     """Columns without the time: indications as `fieldcal calibrate` names them, then accelerations in m/s2."""
     if content.axes == 3:
         return ["vx", "vy", "vz", *(["ax", "ay", "az"] if content.calibrations or content.smoothed else [])]
     return [QUANTITIES.get(content.unit, f"indication_{content.unit}")]
 
 
-def write_csv(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+def write_csv(path: Path, content: RecordedContent, blocks: Iterable[ExportedSamples]) -> int:
     """Write `time_s` (UTC since 1970, all nine digits) and the columns; `nan` is a value that is not there.
 
     Samples that are corrected by S and Q smoothed over the past have a last column, `calibration`, and lines with # at
@@ -42,7 +42,7 @@ def write_csv(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
     return rows
 
 
-def _about(content: Content) -> dict[str, str]:
+def _about(content: RecordedContent) -> dict[str, str]:
     """What a table of corrected samples says of itself."""
     if content.smoothed is None:
         return {}
@@ -57,7 +57,7 @@ def cell(text: str) -> str:
     return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
 
 
-def write_parquet(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+def write_parquet(path: Path, content: RecordedContent, blocks: Iterable[ExportedSamples]) -> int:
     """Write `time` (a date of UTC in ns) and the columns as float64. Raises ExportError without pyarrow."""
     try:
         import pyarrow as pa
@@ -80,7 +80,7 @@ def write_parquet(path: Path, content: Content, blocks: Iterable[Samples]) -> in
     return rows
 
 
-def columns(content: Content, block: Samples) -> Array:
+def columns(content: RecordedContent, block: ExportedSamples) -> Array:
     """The columns (n, k) in the order of `names_of`."""
     if content.axes != 3 or not (content.calibrations or content.smoothed):
         return block.values
@@ -89,7 +89,7 @@ def columns(content: Content, block: Samples) -> Array:
 
 
 def _gathered(
-    content: Content, blocks: Iterable[Samples], rows: int = 1 << 16
+    content: RecordedContent, blocks: Iterable[ExportedSamples], rows: int = 1 << 16
 ) -> Iterator[tuple[NDArray[np.int64], Array, NDArray[np.int64]]]:
     """Blocks put together to pieces of about so many rows: a file with a part for each block would be slow to read."""
     held: list[tuple[NDArray[np.int64], Array, NDArray[np.int64]]] = []

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.export.samples import Content, ExportError, Samples, new_file
+from agent.export.samples import ExportedSamples, ExportError, RecordedContent, new_file
 from agent.export.tables import columns, names_of
 from calib.model import Array
 
@@ -31,7 +31,7 @@ ID_CHARACTERS, ENTITY_CHARACTERS, LABEL_CHARACTERS = 80, 10, 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Part:
+class _EvenSamples:
     """Samples without a hole: `values` (n, k) in a file, the first at `begin_ns`, one each `step_s` s."""
 
     begin_ns: int
@@ -40,7 +40,7 @@ class _Part:
     values: Array
 
 
-def write_uff(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
+def write_uff(path: Path, content: RecordedContent, blocks: Iterable[ExportedSamples]) -> int:
     """Write a set of each signal, in each part without a lost sample; gives the number of samples.
 
     The first set states SI units. The times of a set are equally spaced and count in s from the first sample of the
@@ -73,9 +73,11 @@ def write_uff(path: Path, content: Content, blocks: Iterable[Samples]) -> int:
     return rows
 
 
-def _parts(path: Path, content: Content, blocks: Iterable[Samples], held: Path) -> Iterator[_Part]:
+def _parts(
+    path: Path, content: RecordedContent, blocks: Iterable[ExportedSamples], held: Path
+) -> Iterator[_EvenSamples]:
     """The parts in order; each is gathered in the file `held`, so that one signal at a time is in memory."""
-    gathered: list[Samples] = []  # first and newest block of a part
+    gathered: list[ExportedSamples] = []  # first and newest block of a part
     count = parts = missing = 0
     file = held.open("wb")
     try:
@@ -101,14 +103,16 @@ def _parts(path: Path, content: Content, blocks: Iterable[Samples], held: Path) 
         file.close()
 
 
-def _part(content: Content, gathered: list[Samples], count: int, missing: int, held: Path) -> _Part:
+def _part(
+    content: RecordedContent, gathered: list[ExportedSamples], count: int, missing: int, held: Path
+) -> _EvenSamples:
     begin_ns, end_ns = int(gathered[0].t_utc_ns[0]), int(gathered[-1].t_utc_ns[-1])
     step_s = (end_ns - begin_ns) * 1e-9 / (count - 1) if count > 1 else 1.0 / gathered[0].rate_hz
     values = np.memmap(held, "<f8", "r", shape=(count, len(names_of(content))))
-    return _Part(begin_ns, step_s, missing, values)
+    return _EvenSamples(begin_ns, step_s, missing, values)
 
 
-def _set(content: Content, k: int, part: _Part, since_ns: int) -> dict[str, Any]:
+def _set(content: RecordedContent, k: int, part: _EvenSamples, since_ns: int) -> dict[str, Any]:
     """The head of the set of a column; `since_ns`: begin of the part after that of the file."""
     axis, corrected = k % content.axes, k >= content.axes
     unit = "m/s2" if corrected else content.unit

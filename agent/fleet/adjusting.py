@@ -11,8 +11,8 @@ from agent.fleet.meeting import Meeting
 from calib.distributions import coverage_factor
 from calib.estimate.determined import determined
 from calib.model import Array
-from calib.site_adjustment.contradiction import Verdict, suspects, verdicts
-from calib.site_adjustment.device import Device
+from calib.site_adjustment.contradiction import DeviceVerdict, suspects, verdicts
+from calib.site_adjustment.device import SiteDevice
 from calib.site_adjustment.link import GRAVITY_NAME
 from calib.site_adjustment.site import Site
 
@@ -26,8 +26,8 @@ class Adjusted:
 
     site: Site
     meetings: Sequence[Meeting]
-    tests: Sequence[Verdict]
-    suspects: Sequence[Verdict]
+    tests: Sequence[DeviceVerdict]
+    suspects: Sequence[DeviceVerdict]
 
     def coverage_factor(self, name: str) -> float:
         """For about 95 % coverage, by the fewest degrees of freedom among the links of a device."""
@@ -51,13 +51,13 @@ class Adjusted:
         return [name for name in self.site.devices if name in own]
 
 
-def adjusted(devices: Sequence[Device], meetings: Sequence[Meeting]) -> Adjusted:
+def adjusted(devices: Sequence[SiteDevice], meetings: Sequence[Meeting]) -> Adjusted:
     """Adjust all meetings that became a link. Raises ValueError if none did."""
     links = [m.found for m in meetings if m.found is not None]
     if not links:
         raise ValueError("no meeting of a sensor with a reference can be used")
     if any((GRAVITY_NAME, 0) in found.shared for found in links):
-        devices = [*devices, Device.gravity(max(m.u_gravity_mps2 for m in meetings))]
+        devices = [*devices, SiteDevice.gravity(max(m.u_gravity_mps2 for m in meetings))]
     site = Site(devices, links)
     tests = verdicts(site)
     return Adjusted(site, meetings, tests, suspects(tests))

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import msgspec
 
-from agent.export.samples import Content, content_of, samples, sensors_of
+from agent.export.samples import RecordedContent, content_of, samples, sensors_of
 from agent.export.seismic import write_mseed
 from agent.export.tables import write_csv, write_parquet
 from agent.export.uff import write_uff
@@ -44,7 +44,7 @@ def stem(place: str) -> str:
     return f"{_plain(PurePosixPath(place).name)}.{hashlib.sha256(os.fsencode(place)).hexdigest()[:16]}"
 
 
-def _exported(path: Path, content: Content, begin: str, ending: str, directory: Path) -> Exported:
+def _exported(path: Path, content: RecordedContent, begin: str, ending: str, directory: Path) -> Exported:
     file = directory / f"{begin}.{_plain(content.device)}.{ending}"
     new = file.with_name(f"{file.name}.new")
     new.unlink(missing_ok=True)

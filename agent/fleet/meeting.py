@@ -22,7 +22,7 @@ from calib.recorded.options import Options
 from calib.recorded.priors import NOMINAL_TRANSVERSE, instrument_of, priors_of
 from calib.recorded.tables import Tables
 from calib.signal.response import FLAT, Response
-from calib.site_adjustment.device import Device
+from calib.site_adjustment.device import SiteDevice
 from calib.site_adjustment.link import Link, link
 
 WORST_CONDITION = 1e3  # of S: a dead output makes it infinite
@@ -128,14 +128,14 @@ def met(sensor: str, reference: str, params: dict[str, Any], known: tuple[Array,
     return replace(found, found=None, reasons=(reason,))
 
 
-def device(name: str, section: DeviceSection, directory: Path, meetings: list[Meeting]) -> Device:
+def device(name: str, section: DeviceSection, directory: Path, meetings: list[Meeting]) -> SiteDevice:
     """What is known of a device before any link. Raises TableError."""
     known = stated(section, directory)
     if known is not None:
-        return Device.known(name, *known)
+        return SiteDevice.known(name, *known)
     if section.u_sensitivity_pct is not None:
         channels = max((m.channels for m in meetings if m.reference == name), default=3)
-        return Device.reference(name, section.u_sensitivity_pct / 100.0, channels)
+        return SiteDevice.reference(name, section.u_sensitivity_pct / 100.0, channels)
     first = next((m.found for m in meetings if m.found is not None and m.sensor == name), None)
     mean = np.append(np.eye(3).ravel(), np.zeros(3)) if first is None else first.mean
-    return Device.known(name, mean, np.diag(np.full(12, np.inf)))
+    return SiteDevice.known(name, mean, np.diag(np.full(12, np.inf)))

@@ -36,13 +36,13 @@ from calib.model import Array
 from calib.recorded.poses import PoseInterval
 from calib.recorded.table import ReferenceTable, SensorTable
 from calib.recorded.tables import Making, Tables
-from calib.site_adjustment.device import Device
+from calib.site_adjustment.device import SiteDevice
 
 YEAR_S = YEAR_DAYS * 86400.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
+class RecordedChannel:
     """A channel of a recording: identities, tables, priors with what is known of S and Q, and why it is not used."""
 
     sensor: str
@@ -67,10 +67,10 @@ def _starts(paths: Sequence[Path]) -> Iterator[tuple[Path, RunStart]]:
         yield path, start
 
 
-def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
+def meetings_in(paths: Sequence[Path]) -> tuple[list[SiteDevice], list[Meeting]]:
     """The devices and meetings of recordings. Raises TableError."""
     found = [one for path, start in _starts(paths) for one in _channels(path, start)]
-    together: dict[tuple[str, str], list[Recorded]] = {}
+    together: dict[tuple[str, str], list[RecordedChannel]] = {}
     for one in found:
         together.setdefault((one.sensor, one.reference), []).append(one)
     if len(gravities := {one.gravity_mps2 for one in found}) > 1:
@@ -78,7 +78,7 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
             f"the recordings state different gravity ({', '.join(f'{g:g}' for g in sorted(gravities))} m/s2), so they "
             "are not of one site; adjust them apart"
         )
-    meetings, devices = [], dict[str, Device]()
+    meetings, devices = [], dict[str, SiteDevice]()
     sensors = {one.sensor for one in found if one.tables is not None}
     for (sensor, reference), own in together.items():
         tables = [one.tables for one in own if one.tables is not None]
@@ -93,12 +93,12 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[Device], list[Meeting]]:
         mean, covariance = first.priors.parameters, first.priors.covariance
         assert mean is not None
         assert covariance is not None
-        devices.setdefault(sensor, Device.known(sensor, mean, covariance))
-        devices.setdefault(reference, Device.reference(reference, first.priors.reference, first.channels))
+        devices.setdefault(sensor, SiteDevice.known(sensor, mean, covariance))
+        devices.setdefault(reference, SiteDevice.reference(reference, first.priors.reference, first.channels))
     return list(devices.values()), meetings
 
 
-def _channels(path: Path, start: RunStart) -> Iterator[Recorded]:
+def _channels(path: Path, start: RunStart) -> Iterator[RecordedChannel]:
     try:
         config = recorded_config(start.config_json)
     except (ValueError, OverflowError) as error:
@@ -119,12 +119,12 @@ def _channels(path: Path, start: RunStart) -> Iterator[Recorded]:
             yield _recorded(path, start, beside, infos)
 
 
-def _recorded(path: Path, start: RunStart, channel: Channel, infos: dict[str, str]) -> Recorded:
+def _recorded(path: Path, start: RunStart, channel: Channel, infos: dict[str, str]) -> RecordedChannel:
     names = [identity_of(infos[n]) if n in infos else n or "" for n in (channel.sensor, channel.reference)]
     priors = channel.priors(fixed_mount=channel.fixed_mount)
     reason = _unusable(start, channel, infos)
     if reason:
-        return Recorded(names[0], names[1], 0, priors, channel.gravity_mps2, None, f"{path}: {reason}")
+        return RecordedChannel(names[0], names[1], 0, priors, channel.gravity_mps2, None, f"{path}: {reason}")
     assert channel.reference is not None
     mean = channel.prior.mean(nominal_of(json.loads(infos[channel.sensor])))
     u = channel.prior.standard_uncertainty(mean)
@@ -142,7 +142,7 @@ def _recorded(path: Path, start: RunStart, channel: Channel, infos: dict[str, st
             channel.instrument,
             Making(settings, guard_s=channel.guard_s),
         )
-    return Recorded(names[0], names[1], reference.shape[1] - 1, stated, channel.gravity_mps2, tables)
+    return RecordedChannel(names[0], names[1], reference.shape[1] - 1, stated, channel.gravity_mps2, tables)
 
 
 def _unusable(start: RunStart, channel: Channel, infos: dict[str, str]) -> str:

@@ -37,7 +37,7 @@ class Summary(msgspec.Struct, kw_only=True):
     exported: list[Exported] = []
 
 
-class _Read(msgspec.Struct):
+class _FileResultRead(msgspec.Struct):
     """A FileResult as JSON gives it: a number that is not known is null there."""
 
     place: str
@@ -82,7 +82,7 @@ def results_of(
             before.unchanged = True
             yield before
         else:
-            read = msgspec.json.decode(result, type=_Read)
+            read = msgspec.json.decode(result, type=_FileResultRead)
             if directory is not None and read.sha256:  # of a recording that could not be read there is nothing to keep
                 _write(result_path(directory, task.place), result)
             yield _summary(read)
@@ -93,10 +93,10 @@ def result_path(directory: Path, place: str) -> Path:
     return directory / f"{stem(place)}.json"
 
 
-def _read(directory: Path, place: str) -> _Read | None:
+def _read(directory: Path, place: str) -> _FileResultRead | None:
     """The result that is there; None where there is none, or none that can be read."""
     try:
-        found = msgspec.json.decode(read_file(result_path(directory, place), LARGEST_RESULT), type=_Read)
+        found = msgspec.json.decode(read_file(result_path(directory, place), LARGEST_RESULT), type=_FileResultRead)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
     whole = all(_size(directory / one.file) == one.bytes for one in found.exported)
@@ -120,7 +120,7 @@ def _write(path: Path, result: bytes) -> None:
     new.replace(path)
 
 
-def _summary(read: _Read) -> Summary:
+def _summary(read: _FileResultRead) -> Summary:
     last = {str(update.get("sensor")): update for update in read.calibrations}
     replayed = read.replayed or {}
     return Summary(

@@ -25,7 +25,7 @@ class SettingError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class ChangedSetting:
     """One changed setting. `channel`: the sensor's name, "*" for all. `path`: the keys below the channel.
 
     `scaled`: `value` multiplies the recorded number instead of replacing the recorded value.
@@ -38,7 +38,7 @@ class Setting:
     scaled: bool
 
     @staticmethod
-    def of(text: str) -> Setting:
+    def of(text: str) -> ChangedSetting:
         """Read KEY=VALUE or KEY*=FACTOR; the value is written as in TOML. Raises SettingError."""
         key, equals, value_text = text.partition("=")
         scaled = key.endswith("*") and not key.endswith(".*")
@@ -51,7 +51,7 @@ class Setting:
         value = _value(value_text.strip())
         if scaled and (isinstance(value, bool) or not isinstance(value, int | float)):
             raise SettingError(f"{key}: *= needs a number, not {value_text.strip()[:100]!r}")
-        setting = Setting(text, parts[1], tuple(parts[2:]), value, scaled)
+        setting = ChangedSetting(text, parts[1], tuple(parts[2:]), value, scaled)
         setting._check()
         return setting
 
@@ -71,7 +71,7 @@ class Setting:
                     raise SettingError(f"{shown(('channels', self.channel, *path))}: {what}") from None
 
 
-def changed_config(config_json: str, settings: Sequence[Setting]) -> Config:
+def changed_config(config_json: str, settings: Sequence[ChangedSetting]) -> Config:
     """The recorded configuration with the settings changed. Raises SettingError, or ValueError where it is none."""
     raw = recorded_config(config_json).model_dump(mode="json")
     for setting in settings:
@@ -88,7 +88,7 @@ def changed_config(config_json: str, settings: Sequence[Setting]) -> Config:
         raise SettingError("; ".join(lines[:5])) from None
 
 
-def _change(channel: dict[str, Any], setting: Setting) -> None:
+def _change(channel: dict[str, Any], setting: ChangedSetting) -> None:
     key = ".".join(("channels", channel["sensor"], *setting.path))
     held: Any = channel
     for part in setting.path[:-1]:

@@ -25,7 +25,7 @@ import zenoh
 
 from agent import __version__
 from agent.core.events import Result, StatusChange
-from agent.delivery.history import FILE_NAME, Record, connect_read_only
+from agent.delivery.history import FILE_NAME, StoredResult, connect_read_only
 from agent.delivery.keys import PREFIX, result_key
 from agent.delivery.publication import Publisher
 from agent.delivery.received import LARGEST_RESULT
@@ -61,14 +61,14 @@ NOTHING = SensorHealth(status="", reason="", windows_used=0, windows_refused=0, 
 NO_RECORDING = RecordingHealth(active=False, file="", size_bytes=0, fault="")
 
 
-class Stop(Protocol):
+class StopEvent(Protocol):
     """The part of an event of threads or processes that is used here."""
 
     def is_set(self) -> bool: ...
     def wait(self, timeout: float | None = None) -> bool: ...
 
 
-NEVER: Stop = threading.Event()
+NEVER: StopEvent = threading.Event()
 
 
 class Stories:
@@ -145,7 +145,7 @@ class SimulatedGateway:
         """Number of its last result."""
         return self._store.last_sequence()
 
-    def open(self, stop: Stop) -> bool:
+    def open(self, stop: StopEvent) -> bool:
         """Connect; False where no router answers within CONNECT_S."""
         self._publisher.start()
         end = monotonic() + CONNECT_S
@@ -153,7 +153,7 @@ class SimulatedGateway:
             sleep(0.01)
         return self._publisher.state().connected
 
-    def step(self, t_utc_ns: int, stop: Stop) -> int:
+    def step(self, t_utc_ns: int, stop: StopEvent) -> int:
         """Make, store and publish the results of the next round; returns how many, 0 where it is to stop.
 
         A silent gateway leaves the bus when all that it has made is published.
@@ -202,7 +202,7 @@ class SimulatedGateway:
         self._publisher.close(CLOSE_S)
         self._store.close()
 
-    def _cloned(self, stop: Stop) -> SimulatedGateway:
+    def _cloned(self, stop: StopEvent) -> SimulatedGateway:
         """Another gateway with a copy of all that this one has, but for its sensors."""
         directory = self._data_dir / f"{self.name}-twin"
         (directory / self.name).mkdir(parents=True)
@@ -236,12 +236,12 @@ class SimulatedGateway:
             told |= {"state": "catching up", "reasons": [reason]}
         self._publisher.tell_status(msgspec.json.encode(told))
 
-    def _record(self, result: Result) -> Record:
+    def _record(self, result: Result) -> StoredResult:
         signed = self._signing.signed(result.sequence, result)
         data = signed.data if signed is not None else b""
-        return Record.of(result, recorded=True, recording="simulated.mcap", epoch=self._store.epoch, signed=data)
+        return StoredResult.of(result, recorded=True, recording="simulated.mcap", epoch=self._store.epoch, signed=data)
 
-    def _attack(self, records: Sequence[Record]) -> None:
+    def _attack(self, records: Sequence[StoredResult]) -> None:
         """What a stranger on the bus may send: to keys of its own and of others, through a session of its own.
 
         While no router answers, it sends nothing.
@@ -254,7 +254,7 @@ class SimulatedGateway:
             for key, payload, attachment in self._hostile(records):
                 session.put(key, payload, attachment=attachment)
 
-    def _hostile(self, records: Sequence[Record]) -> Iterator[tuple[str, bytes, bytes]]:
+    def _hostile(self, records: Sequence[StoredResult]) -> Iterator[tuple[str, bytes, bytes]]:
         own, victim = f"{PREFIX}/{SITE}/{self.name}", f"{PREFIX}/{SITE}/gw0000"
         yield result_key(own, "s0", "status"), b"\xff\xfe not JSON", b"0"
         yield result_key(own, "s0", "window"), b"[" * 100_000, b"0"
@@ -274,7 +274,7 @@ class SimulatedFleet(AbstractContextManager["SimulatedFleet"]):
 
     def __init__(
         self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path,
-        numbers: Sequence[int] | None = None, stop: Stop = NEVER,
+        numbers: Sequence[int] | None = None, stop: StopEvent = NEVER,
     ) -> None:  # fmt: skip
         self._stop = stop
         numbers = range(count) if numbers is None else numbers

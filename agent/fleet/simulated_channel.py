@@ -20,7 +20,7 @@ from agent.core.estimation import DAY_S
 from agent.core.events import DeviceChange, Result
 from agent.core.identity import identity_of
 from agent.core.schedule import pose_beside
-from agent.core.streams import Verdict
+from agent.core.streams import JudgedWindow
 from agent.engine import identity
 from calib.excitation.front_end import Settings, windows_of
 from calib.geometry import STANDARD_GRAVITY_MPS2
@@ -46,7 +46,7 @@ SITE_REFERENCE = "4711"  # serial number: all sensors of the fleet met one refer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class WindowTruth:
     """What is true of a sensor during a window.
 
     `sensitivity` (3, 3) in counts per m/s2, rows are outputs, in the frame of the reference; `offset` (3,) in counts;
@@ -77,7 +77,7 @@ class SimulatedChannel:
         return [result for name, info in self._infos.items()
                 for result in self._state.on_device(_change(name, "open", t_utc_ns, info=info))]  # fmt: skip
 
-    def window(self, truth: Truth, t_utc_ns: int) -> list[Result]:
+    def window(self, truth: WindowTruth, t_utc_ns: int) -> list[Result]:
         """A window of WINDOW_S that ends now."""
         return self._state.on_window(self._drawn(truth), t_utc_ns)
 
@@ -94,7 +94,7 @@ class SimulatedChannel:
         self._state.number(numbered)
         return numbered
 
-    def _drawn(self, truth: Truth) -> Window:
+    def _drawn(self, truth: WindowTruth) -> Window:
         count = round(RATE_HZ * (WINDOW_S + 2.0 * MARGIN_S))
         motion, white = _motion(self._random, count), self._random.standard_normal((2, count, 3))
         indications = (motion + truth.gravity_mps2 + truth.noise_mps2 * white[0]) @ truth.sensitivity.T + truth.offset
@@ -117,7 +117,7 @@ class _WindowByWindow(ChannelState):
         estimation.date_certificate(day, t_utc_ns)
         explained = self._explain()  # of the windows before, as in the time between two windows
         judged = estimation.judge(window, day, 0.0, TEMPERATURE_DEGC) if window.used else None
-        return [*explained, *self._results(Verdict(window, judged, 0.0))]
+        return [*explained, *self._results(JudgedWindow(window, judged, 0.0))]
 
 
 def identity_with(serial_number: str) -> str:

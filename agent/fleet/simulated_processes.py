@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from agent.delivery.ending import Ending
+from agent.delivery.ending import ProcessEnd
 from agent.delivery.session import session_config
 from agent.fleet.simulated import SimulatedFleet
 from agent.fleet.simulated_sensor import Behaviour
@@ -58,7 +58,7 @@ class Stopping:
         return {"_reader": self._reader}  # only its maker has the end that keeps it open
 
 
-class Named(NamedTuple):
+class NamedGateway(NamedTuple):
     """A gateway of the fleet. `source`: `<site>/<gateway>`; `public_key`: of its signatures, 32 bytes."""
 
     name: str
@@ -80,7 +80,7 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
         """`stop`: once it is set, what is going on ends soon."""
         session_config("client", connect=connect)  # raises EndpointError here rather than in another process
         parts = -(-count // GATEWAYS_EACH)
-        self.gateways: list[Named] = []
+        self.gateways: list[NamedGateway] = []
         self.unconnected = 0
         self._parts: list[ProcessPoolExecutor] = []
         self._stop = stop or Stopping()
@@ -156,17 +156,17 @@ def _without_interrupts() -> Iterator[None]:
 def _begin(stop: Stopping) -> None:
     global _stop
     _stop = stop
-    Ending().status = 0
+    ProcessEnd().status = 0
     begin()
     os.nice(NICE)
 
 
 def _open(
     count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path, numbers: Sequence[int]
-) -> tuple[list[Named], int]:
+) -> tuple[list[NamedGateway], int]:
     global _part
     _part = SimulatedFleet(count, sensors, seed, connect, data_dir, numbers, _stop)
-    return [Named(g.name, g.source, g.behaviour, g.public_key) for g in _part.gateways], _part.unconnected
+    return [NamedGateway(g.name, g.source, g.behaviour, g.public_key) for g in _part.gateways], _part.unconnected
 
 
 def _step(t_utc_ns: int, within_s: float) -> int:

@@ -14,7 +14,14 @@ import msgspec
 import numpy as np
 
 from agent.core.events import CalibrationUpdate, Estimate, Result, StatusChange
-from agent.fleet.simulated_channel import GRAVITY_MPS2, NOISE_MPS2, NOMINAL, SimulatedChannel, Truth, identity_with
+from agent.fleet.simulated_channel import (
+    GRAVITY_MPS2,
+    NOISE_MPS2,
+    NOMINAL,
+    SimulatedChannel,
+    WindowTruth,
+    identity_with,
+)
 from calib.model import Array
 
 Behaviour = Literal[
@@ -83,7 +90,7 @@ class Story:
             "sensitivity": truth.sensitivity.tolist(), "offset": truth.offset.tolist(),
         }  # fmt: skip
 
-    def truth(self, number: int) -> Truth:
+    def truth(self, number: int) -> WindowTruth:
         """What is true in a round; of the newest one, as sensitivity and offset have wandered until then."""
         since, gravity, noise, dead = number - BEGINS[self.behaviour], GRAVITY_MPS2, NOISE_MPS2, None
         sensitivity = self._sensitivity.copy()
@@ -93,7 +100,7 @@ class Story:
         if self.behaviour == "dying" and since >= 0:
             noise *= NOISE_GROWS ** min(since + 1, NOISY_ROUNDS)
             dead = self._axis if since >= NOISY_ROUNDS else None
-        return Truth(NOMINAL * sensitivity, NOMINAL * self._offset_mps2, gravity, noise, dead)
+        return WindowTruth(NOMINAL * sensitivity, NOMINAL * self._offset_mps2, gravity, noise, dead)
 
     @property
     def _parameter(self) -> str:

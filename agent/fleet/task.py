@@ -16,7 +16,7 @@ from agent.audit.replaying import PipelineLike, Replayed, ReplayedFile, Replayer
 from agent.core.events import CalibrationUpdate, WindowReport
 from agent.export.samples import ExportError
 from agent.fleet.exporting import Exported, exported
-from agent.fleet.settings import Setting, SettingError, changed_config
+from agent.fleet.settings import ChangedSetting, SettingError, changed_config
 from agent.fleet.sources import SourceError, local
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.reading import open_recording
@@ -27,8 +27,8 @@ UNCHANGED = b""  # in place of a result: the one that is known still holds
 class Task(msgspec.Struct, frozen=True, kw_only=True):
     """What is to be done. Everything in it may be written to a log: it holds no credentials.
 
-    `place`: a path or an address. `settings`: as `Setting.of` reads them. `known`: the fields `sha256` and `made_by`
-    of a result that is there already.
+    `place`: a path or an address. `settings`: as `ChangedSetting.of` reads them. `known`: the fields `sha256` and
+    `made_by` of a result that is there already.
     """
 
     place: str
@@ -80,7 +80,7 @@ def _result(task: Task) -> FileResult | None:
             if task.export:
                 result.exported = exported(path, task.place, task.export, Path(task.directory))
                 return result
-            settings = [Setting.of(text) for text in task.settings]
+            settings = [ChangedSetting.of(text) for text in task.settings]
             if task.audit:
                 engines = Engines(_recorded)
                 audited = audit_file(path, replayer=Replayer(engines, here, OTHER_CPU), trusted=engines.trusts)
@@ -110,7 +110,7 @@ def _result(task: Task) -> FileResult | None:
     return result
 
 
-def _recomputed(path: Path, settings: Sequence[Setting], here: dict[str, str], result: FileResult) -> Replayed:
+def _recomputed(path: Path, settings: Sequence[ChangedSetting], here: dict[str, str], result: FileResult) -> Replayed:
     """The replay under changed settings: other results than the recorded ones are what was asked for."""
     from agent.core.anew import anew
     from agent.core.pipeline import Pipeline

@@ -15,7 +15,7 @@ from agent.terminal.text import say
 from calib.model import Array
 from calib.recorded.outcome import plain
 from calib.rounding import plus_minus
-from calib.site_adjustment.contradiction import FALSE_ALARM, Verdict
+from calib.site_adjustment.contradiction import FALSE_ALARM, DeviceVerdict
 from calib.site_adjustment.link import GRAVITY_NAME
 
 METHOD = "site adjustment"
@@ -42,7 +42,7 @@ def reasons(found: Adjusted) -> list[str]:
     ]
 
 
-def _size(found: Adjusted, bad: Verdict) -> str:
+def _size(found: Adjusted, bad: DeviceVerdict) -> str:
     if not bad.is_reference or bad.device == GRAVITY_NAME:
         return ""
     worst = int(np.argmax(np.abs(bad.bias[[0, 4, 8]])))
@@ -113,7 +113,7 @@ def _gravity(found: Adjusted) -> dict[str, float] | None:
     return {"value_mps2": float(found.site.x[GRAVITY_NAME][0]), "standard_uncertainty_mps2": u}
 
 
-def _test(verdict: Verdict) -> dict[str, Any]:
+def _test(verdict: DeviceVerdict) -> dict[str, Any]:
     return {
         "device": verdict.device,
         "as": "reference" if verdict.is_reference else "sensor",

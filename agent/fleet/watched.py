@@ -40,7 +40,7 @@ class WatchError(Exception):
 Numbers = list[float | None]
 
 
-class Line(msgspec.Struct, kw_only=True):
+class WatchLine(msgspec.Struct, kw_only=True):
     """A `watch` result as it is published. `key`, `site` and `gateway` say where it comes from."""
 
     sensor: str
@@ -105,7 +105,7 @@ class Watched:
         visited = np.zeros(n, dtype=bool)
         for (i, hour), (_, file, offset) in sorted(self.places[number].items(), key=lambda item: item[0][::-1]):
             opened[file].seek(offset)
-            line = msgspec.json.decode(opened[file].readline(LONGEST_LINE), type=Line)
+            line = msgspec.json.decode(opened[file].readline(LONGEST_LINE), type=WatchLine)
             h, at = hour - HOURS * number, [bands[band] for band in _grid(line.band_hz)]
             power[h, i, at] = _matrix(line.band_power)
             cross[h, i, at] = _matrix(line.cross_power)
@@ -147,7 +147,7 @@ def _taken(
     if len(data) >= LONGEST_LINE:
         return f"a line of more than {LONGEST_LINE} bytes"
     try:
-        line = msgspec.json.decode(data, type=Line)
+        line = msgspec.json.decode(data, type=WatchLine)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         return f"not a watch result: {_short(str(error))}"
     reason = _wrong(line)
@@ -173,7 +173,7 @@ def _taken(
     return "" if before is None else "an hour of a sensor twice; the one with the higher sequence is used"
 
 
-def _wrong(line: Line) -> str:
+def _wrong(line: WatchLine) -> str:
     """Why the content of a line cannot be used; "" where it can."""
     b = len(line.band_hz)
     hour, odd = divmod(line.hour_utc_ns, HOUR_NS)

@@ -12,7 +12,7 @@ import numpy as np
 
 from agent import __version__
 from agent.fleet.watched import Watched
-from calib.site_watch.verdicts import WALK_PER_ROOT_DAY, Result, Told, result
+from calib.site_watch.verdicts import WALK_PER_ROOT_DAY, SensorVerdict, SiteVerdicts, result
 from calib.site_watch.watch import SiteWatch
 
 U_VISIT = 0.003  # relative standard uncertainty of what a visit finds
@@ -31,12 +31,12 @@ TOLD_UNITS = {"turn": ("°", math.degrees(1.0)), "": (" %", 100.0)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class SiteView:
     """A site with its verdicts. `order`: sensors by what a visit would tell, most first, with the information in
     nat."""
 
     watched: Watched
-    found: Result
+    found: SiteVerdicts
     order: Sequence[tuple[int, float]]
 
     @property
@@ -46,7 +46,7 @@ class Seen:
         return any(one.kind not in ("none", "learning") for one in told)
 
 
-def seen(files: Watched, beside_reference: Sequence[int] = ()) -> Seen:
+def seen(files: Watched, beside_reference: Sequence[int] = ()) -> SiteView:
     """Watch the site over all its days. `beside_reference`: numbers of the sensors that have one."""
     gateways = files.gateways
     watch = SiteWatch(np.array([gateways.index(gateway) for gateway, _ in files.sensors]), files.band_hz)
@@ -56,10 +56,10 @@ def seen(files: Watched, beside_reference: Sequence[int] = ()) -> Seen:
     for i in beside_reference:
         known[i] = files.u_main.get(i, U_UNKNOWN)
     found = result(watch, known)
-    return Seen(files, found, _order(files, found, beside_reference))
+    return SiteView(files, found, _order(files, found, beside_reference))
 
 
-def _order(files: Watched, found: Result, beside_reference: Sequence[int]) -> list[tuple[int, float]]:
+def _order(files: Watched, found: SiteVerdicts, beside_reference: Sequence[int]) -> list[tuple[int, float]]:
     """What a visit would tell of each sensor: 0.5 ln(1 + u²/u_visit²), with u from its calibration, the walk of its
     sensitivity and what is suspected of it."""
     gain = []
@@ -75,7 +75,7 @@ def _order(files: Watched, found: Result, beside_reference: Sequence[int]) -> li
     return sorted(gain, key=lambda one: -one[1])
 
 
-def rows(what: Seen) -> list[tuple[str, str, str, str, str]]:
+def rows(what: SiteView) -> list[tuple[str, str, str, str, str]]:
     """The table: sensor, verdict, size with U, since, what to do. First what has changed, in the order of visits."""
     found, places = what.found, {i: k for k, (i, _) in enumerate(what.order)}
     table = [("site", *_cells(found.site))] if found.site.kind != "none" else []
@@ -88,19 +88,19 @@ def rows(what: Seen) -> list[tuple[str, str, str, str, str]]:
     return table
 
 
-def _cells(told: Told) -> tuple[str, str, str, str]:
+def _cells(told: SensorVerdict) -> tuple[str, str, str, str]:
     verdict = f"{told.kind}: {told.what}" if told.what else told.kind
     return verdict, _size(told), _since(told), DO.get(told.kind, "")
 
 
-def _size(told: Told) -> str:
+def _size(told: SensorVerdict) -> str:
     if not math.isfinite(told.U):
         return ""
     unit, factor = TOLD_UNITS.get(told.kind, TOLD_UNITS[""])
     return f"{factor * told.size:+.2f} ± {factor * told.U:.2f}{unit}"
 
 
-def _since(told: Told) -> str:
+def _since(told: SensorVerdict) -> str:
     if told.since < 0:
         return ""
     reach = max(told.latest - told.since, told.since - told.earliest, 1)
@@ -112,7 +112,7 @@ def date(day: int) -> str:
     return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(days=day)).date().isoformat()
 
 
-def not_seen(what: Seen) -> list[str]:
+def not_seen(what: SiteView) -> list[str]:
     """What this site cannot show, one sentence each."""
     found, names = what.found, what.watched.sensors
     lines = []
@@ -146,7 +146,7 @@ def _some(names: Sequence[tuple[str, str]], which: Sequence[int]) -> str:
     return told if len(which) <= 5 else f"{told} and {len(which) - 5} more"
 
 
-def as_object(what: Seen) -> dict[str, Any]:
+def as_object(what: SiteView) -> dict[str, Any]:
     """The members of the JSON object of docs/site-watch.md."""
     found, files = what.found, what.watched
     gain = dict(what.order)
@@ -178,7 +178,7 @@ def as_object(what: Seen) -> dict[str, Any]:
     }
 
 
-def _told(told: Told) -> dict[str, Any]:
+def _told(told: SensorVerdict) -> dict[str, Any]:
     unit, factor = ("rad", 1.0) if told.kind == "turn" else ("%", 100.0)
     dated = told.since >= 0
     return {

@@ -23,7 +23,7 @@ Gateway = tuple[str, str]  # site, gateway
 
 
 @dataclass(frozen=True, slots=True)
-class _Heard:
+class _BenchArrival:
     guide: Guide
     at_s: float  # monotonic, when it came
 
@@ -33,7 +33,7 @@ class Benches:
 
     def __init__(self) -> None:
         self.version = 0
-        self._newest: dict[Gateway, _Heard] = {}  # the one that was heard last is the last
+        self._newest: dict[Gateway, _BenchArrival] = {}  # the one that was heard last is the last
         self._mutex = threading.Lock()
 
     def take(self, site: str, gateway: str, guide: Guide) -> None:
@@ -46,7 +46,7 @@ class Benches:
             if before is not None and guide.t_utc_ns < before.guide.t_utc_ns and now_s - before.at_s < BACK_S:
                 return  # one that was recorded and sent again
             self._newest.pop((site, gateway), None)
-            self._newest[site, gateway] = _Heard(guide, now_s)
+            self._newest[site, gateway] = _BenchArrival(guide, now_s)
             if len(self._newest) > BENCHES_MAX:
                 del self._newest[next(iter(self._newest))]
             self.version += before is None or before.guide != guide

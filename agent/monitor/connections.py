@@ -34,7 +34,7 @@ LOG_S = 60.0  # s between two lines of the log about connections, or between two
 Peer = tuple[str, int]  # address and port
 
 
-class Part(Enum):
+class Deadline(Enum):
     """What a client must do in time."""
 
     HEADERS = auto()
@@ -57,7 +57,7 @@ class Connections:
         self._app = app
         self._open: dict[Peer, _Connection] = {}
         # Parts for which the server waits, with the end of its patience; the one that has waited longest is first.
-        self._waiting: dict[tuple[Peer, Part], asyncio.TimerHandle] = {}
+        self._waiting: dict[tuple[Peer, Deadline], asyncio.TimerHandle] = {}
         self._asked: Counter[Peer] = Counter()  # requests that are being answered
         self._told = Seldom(_log, LOG_S)
 
@@ -73,14 +73,14 @@ class Connections:
         self._open[peer] = connection
         if len(self._open) > CROWDED and self._waiting:
             self._end(next(iter(self._waiting))[0])
-        self._wait(peer, Part.HEADERS, HEADERS_S)
+        self._wait(peer, Deadline.HEADERS, HEADERS_S)
         return True
 
     def closed(self, connection: _Connection, peer: Peer) -> None:
         """The socket of a connection is closed."""
         if self._open.get(peer) is connection:
             del self._open[peer]
-            self._wait_no_more(peer, *Part)
+            self._wait_no_more(peer, *Deadline)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request within the bounds."""
@@ -93,19 +93,19 @@ class Connections:
         async def receive_in_time() -> Message:
             nonlocal whole
             if not whole:  # afterwards an application waits here until the client has gone
-                self._wait(peer, Part.BODY, body_ends_s - time.monotonic())
+                self._wait(peer, Deadline.BODY, body_ends_s - time.monotonic())
             message = await receive()
-            self._wait_no_more(peer, Part.BODY)
+            self._wait_no_more(peer, Deadline.BODY)
             whole = not message.get("more_body", False)
             return message
 
         async def send_in_time(message: Message) -> None:
             for piece in _pieces(message):
-                self._wait(peer, Part.ANSWER, SEND_S)
+                self._wait(peer, Deadline.ANSWER, SEND_S)
                 await send(piece)
-                self._wait_no_more(peer, Part.ANSWER)
+                self._wait_no_more(peer, Deadline.ANSWER)
 
-        self._wait_no_more(peer, Part.HEADERS)
+        self._wait_no_more(peer, Deadline.HEADERS)
         self._asked[peer] += 1
         try:
             await self._app(scope, receive_in_time, send_in_time)
@@ -113,20 +113,20 @@ class Connections:
             self._asked[peer] -= 1
             if not self._asked[peer]:
                 del self._asked[peer]
-                self._wait_no_more(peer, *Part)
-                self._wait(peer, Part.HEADERS, HEADERS_S)
+                self._wait_no_more(peer, *Deadline)
+                self._wait(peer, Deadline.HEADERS, HEADERS_S)
 
-    def _wait(self, peer: Peer, part: Part, limit_s: float) -> None:
+    def _wait(self, peer: Peer, part: Deadline, limit_s: float) -> None:
         if peer in self._open:
             self._waiting[peer, part] = asyncio.get_running_loop().call_later(limit_s, self._end, peer)
 
-    def _wait_no_more(self, peer: Peer, *parts: Part) -> None:
+    def _wait_no_more(self, peer: Peer, *parts: Deadline) -> None:
         for part in parts:
             if (timer := self._waiting.pop((peer, part), None)) is not None:
                 timer.cancel()
 
     def _end(self, peer: Peer) -> None:
-        self._wait_no_more(peer, *Part)
+        self._wait_no_more(peer, *Deadline)
         if peer in self._open:
             self._count()
             with suppress(OSError):  # the client was faster

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from agent.delivery.received import Received
-from agent.monitor.engines import LASTING, Engine, Run
+from agent.monitor.engines import LASTING, DatabaseEngine, QueryRunner
 from agent.monitor.summaries import COUNTS, FULL_DAYS, SUMMARISED, merged, packed, split, summarise, unpacked
 from calib.model import PARAMETERS
 
@@ -59,7 +59,9 @@ class Database:
     DatabaseError where the engine cannot be used.
     """
 
-    def __init__(self, engine: Engine, *, full_days: int = FULL_DAYS, now_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self, engine: DatabaseEngine, *, full_days: int = FULL_DAYS, now_ns: Callable[[], int] = time.time_ns
+    ) -> None:
         self._engine, self._full_days, self._now_ns = engine, full_days, now_ns
         self.damaged: set[int] = set()
         self._mutex = threading.Lock()
@@ -96,7 +98,7 @@ class Database:
             payload=packed(short), detail=detail,
         )  # fmt: skip
 
-    def _insert(self, run: Run, rows: Sequence[_Row]) -> dict[tuple[int, str], tuple[int, bytes]]:
+    def _insert(self, run: QueryRunner, rows: Sequence[_Row]) -> dict[tuple[int, str], tuple[int, bytes]]:
         """Write the rows, and what is the newest after them; returns the last detail of each sensor, with its day."""
         details: dict[tuple[int, str], tuple[int, bytes]] = {}
         newest: dict[tuple[int, str, str], int] = {}
@@ -280,7 +282,7 @@ class Database:
         return self._sensors[place]
 
 
-def _detail_before(run: Run, what: str, day: int, number: int, sensor: int) -> bytes | None:
+def _detail_before(run: QueryRunner, what: str, day: int, number: int, sensor: int) -> bytes | None:
     """The detail of a calibration that says the same as the ones before it on this day."""
     if day == LASTING:
         return None

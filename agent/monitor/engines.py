@@ -23,13 +23,13 @@ class DatabaseError(ConnectionError):
     """PostgreSQL cannot be used. The message says why; it holds no password."""
 
 
-class Run(Protocol):
+class QueryRunner(Protocol):
     """Runs a query with its values by name; returns its rows."""
 
     def __call__(self, sql: str, /, **values: object) -> Rows: ...
 
 
-class Engine(Protocol):
+class DatabaseEngine(Protocol):
     """What differs between the two."""
 
     NUMBER: str  # column type that numbers rows in the order of their arrival
@@ -37,22 +37,22 @@ class Engine(Protocol):
     PARTITIONED: str
 
     @contextmanager
-    def transaction(self) -> Iterator[Run]:
+    def transaction(self) -> Iterator[QueryRunner]:
         """All queries within it take effect, or none. May be used by several threads."""
 
-    def make_tables(self, run: Run, statements: list[str]) -> None:
+    def make_tables(self, run: QueryRunner, statements: list[str]) -> None:
         """Make the tables that are not there yet."""
 
-    def make_day(self, run: Run, day: int) -> None:
+    def make_day(self, run: QueryRunner, day: int) -> None:
         """Before the first result of a day."""
 
-    def writes(self, run: Run) -> None:
+    def writes(self, run: QueryRunner) -> None:
         """Before a transaction adds results: several monitors on one database add theirs one after the other."""
 
-    def forget(self, run: Run, day: int, sensor: int) -> None:
+    def forget(self, run: QueryRunner, day: int, sensor: int) -> None:
         """The results of a sensor on this day are summarised."""
 
-    def drop_day(self, run: Run, day: int) -> None:
+    def drop_day(self, run: QueryRunner, day: int) -> None:
         """The results of all sensors on this day are summarised."""
 
     def close(self) -> None:
@@ -72,12 +72,12 @@ class Sqlite:
         self._connection.execute("PRAGMA synchronous = NORMAL")
 
     @contextmanager
-    def transaction(self) -> Iterator[Run]:
+    def transaction(self) -> Iterator[QueryRunner]:
         with self._mutex, self._connection:
             self._connection.execute("BEGIN")
             yield self._run
 
-    def make_tables(self, run: Run, statements: list[str]) -> None:
+    def make_tables(self, run: QueryRunner, statements: list[str]) -> None:
         columns = [row[1] for row in run("PRAGMA table_info(result)")]
         if columns and "day" not in columns:
             raise sqlite3.DatabaseError(
@@ -87,16 +87,16 @@ class Sqlite:
         for statement in statements:
             run(statement)
 
-    def make_day(self, run: Run, day: int) -> None:
+    def make_day(self, run: QueryRunner, day: int) -> None:
         pass
 
-    def writes(self, run: Run) -> None:
+    def writes(self, run: QueryRunner) -> None:
         pass  # one monitor has the file
 
-    def forget(self, run: Run, day: int, sensor: int) -> None:
+    def forget(self, run: QueryRunner, day: int, sensor: int) -> None:
         run("DELETE FROM result WHERE sensor = :sensor AND day = :day", sensor=sensor, day=day)
 
-    def drop_day(self, run: Run, day: int) -> None:
+    def drop_day(self, run: QueryRunner, day: int) -> None:
         pass
 
     def close(self) -> None:
@@ -132,7 +132,7 @@ class Postgres:
             raise DatabaseError("PostgreSQL needs the extra fleet: fieldcal extras --install fleet") from None
 
     @contextmanager
-    def transaction(self) -> Iterator[Run]:
+    def transaction(self) -> Iterator[QueryRunner]:
         try:
             with self._engine.begin() as connection:
 
@@ -145,38 +145,38 @@ class Postgres:
             cause = str(getattr(error, "orig", None) or error).strip().splitlines()
             raise DatabaseError(f"PostgreSQL {self._where}: {cause[0] if cause else type(error).__name__}") from None
 
-    def make_tables(self, run: Run, statements: list[str]) -> None:
+    def make_tables(self, run: QueryRunner, statements: list[str]) -> None:
         self._lock(run)  # several monitors may begin at once
         run("CREATE SEQUENCE IF NOT EXISTS result_number")
         for statement in statements:
             run(statement)
         self._partition(run, LASTING)
 
-    def make_day(self, run: Run, day: int) -> None:
+    def make_day(self, run: QueryRunner, day: int) -> None:
         self._lock(run)
         self._partition(run, day)
 
-    def writes(self, run: Run) -> None:
+    def writes(self, run: QueryRunner) -> None:
         self._lock(run)  # transactions that change the same rows in another order would wait for each other
 
-    def forget(self, run: Run, day: int, sensor: int) -> None:
+    def forget(self, run: QueryRunner, day: int, sensor: int) -> None:
         pass  # with the partition
 
-    def drop_day(self, run: Run, day: int) -> None:
+    def drop_day(self, run: QueryRunner, day: int) -> None:
         run(f"DROP TABLE IF EXISTS result_{day:d}")
 
     def close(self) -> None:
         self._engine.dispose()
 
     @staticmethod
-    def _lock(run: Run) -> None:
+    def _lock(run: QueryRunner) -> None:
         run("SELECT pg_advisory_xact_lock(:key)", key=_LOCK)
 
     @staticmethod
-    def _partition(run: Run, day: int) -> None:
+    def _partition(run: QueryRunner, day: int) -> None:
         run(f"CREATE TABLE IF NOT EXISTS result_{day:d} PARTITION OF result FOR VALUES FROM ({day:d}) TO ({day + 1:d})")
 
 
-def open_engine(data_dir: Path, url: str | None) -> Engine:
+def open_engine(data_dir: Path, url: str | None) -> DatabaseEngine:
     """PostgreSQL at `url`, else the file `monitor.sqlite` in a directory. Raises sqlite3.Error or DatabaseError."""
     return Sqlite(data_dir / "monitor.sqlite") if url is None else Postgres(url)

@@ -79,7 +79,7 @@ class Fleet:
         self.version = now_ns() // 1_000_000  # after those before a restart, which pages that are open know
         self.left_out = 0
         self._now_ns = now_ns
-        self._heard: dict[Place, _Heard] = {}
+        self._heard: dict[Place, _ArrivalTimes] = {}
         self._silent: set[Place] = set()  # that have not been heard for SILENT_INTERVALS
         self._looked_ns = 0
         self._newest: dict[Place, dict[str, dict[str, Any]]] = {}
@@ -125,7 +125,9 @@ class Fleet:
             if what == "drift":
                 fields = fields | self._judged(place, fields)
             self._newest.setdefault(place, {})[part] = fields
-            self._heard.setdefault(place, _Heard()).take(self._now_ns() if fresh else fields["t_utc_ns"], fresh=fresh)
+            self._heard.setdefault(place, _ArrivalTimes()).take(
+                self._now_ns() if fresh else fields["t_utc_ns"], fresh=fresh
+            )
             self._silent.discard(place)
             self.version += 1
             self._touch(place)
@@ -328,7 +330,7 @@ def _told_of(what: str, fields: dict[str, Any]) -> str:
     return f"{fields['parameter']} {fields['verdict']}: {fields['reason']}" if what == "drift" else ""
 
 
-class _Heard:
+class _ArrivalTimes:
     """When something of a sensor came last, and the intervals between what came."""
 
     def __init__(self) -> None:

@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
-from agent.commanding.allowance import Allowance
+from agent.commanding.allowance import RateLimit
 from agent.commanding.arguments import VERBS
 from agent.commanding.envelope import LARGEST, from_line, parse_envelope
 from agent.commanding.refusal import Refused
@@ -36,7 +36,7 @@ class Forwarding:
 
     def __init__(self, endpoints: Sequence[str], tls: TlsFiles | None, access: Access, fleet: Fleet) -> None:
         self._endpoints, self._tls, self._access, self._fleet = endpoints, tls, access, fleet
-        self._allowance = Allowance(*FORWARDED)
+        self._allowance = RateLimit(*FORWARDED)
         self._at_once = anyio.CapacityLimiter(AT_ONCE)
 
     async def command(self, request: Request) -> Response:

@@ -44,7 +44,7 @@ class _Login(msgspec.Struct, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class LoginSession:
     """A user who has logged in. `hashed`: the password then. `token`: every request that changes something has it."""
 
     user: str
@@ -99,7 +99,7 @@ class Access:
 
     def __init__(self, users: Path | None) -> None:
         self._users = Users(users) if users is not None else None
-        self._sessions: dict[bytes, Session] = {}  # by the SHA-256 of the cookie
+        self._sessions: dict[bytes, LoginSession] = {}  # by the SHA-256 of the cookie
         self._of_user, self._of_address = Delays(FREE_OF_USER), Delays(FREE_OF_ADDRESS)
         self._told = Seldom(_log, LOG_S)
         self._checking = anyio.CapacityLimiter(AT_ONCE)
@@ -126,7 +126,7 @@ class Access:
 
         return checked
 
-    def user(self, request: Request) -> tuple[User, Session]:
+    def user(self, request: Request) -> tuple[User, LoginSession]:
         """The user who asks, with the rights that the file states now. Raises HTTPException 401 where there is none."""
         key = hashlib.sha256(request.cookies.get(_cookie(request), "").encode()).digest()
         session = self._sessions.get(key)
@@ -193,7 +193,7 @@ class Access:
 
     def _begin(self, request: Request, user: User) -> Response:
         cookie, token = secrets.token_urlsafe(32), secrets.token_urlsafe(32)
-        session = Session(user.name, user.hashed, token, time.monotonic() + SESSION_S)
+        session = LoginSession(user.name, user.hashed, token, time.monotonic() + SESSION_S)
         self._sessions[hashlib.sha256(cookie.encode()).digest()] = session
         if len(self._sessions) > SESSIONS_MAX:
             del self._sessions[next(iter(self._sessions))]

@@ -25,7 +25,7 @@ AGAIN = timedelta(days=7)  # after which a certificate that ends is told again
 _log = logging.getLogger(__name__)
 
 
-class Watch:
+class FleetWatch:
     """What is told of a fleet. `update` takes the time, so that the same fleet gives the same notices."""
 
     def __init__(self, fleet: Fleet, settings: Notices, certificates: Sequence[Path]) -> None:
@@ -86,14 +86,14 @@ class Watch:
         return found
 
 
-class Notifier:
+class NoticeSender:
     """Sends the notices of a watch, in a thread, until `close`.
 
     `fault`: why the last message was not sent; "" if it was. A message has all notices since the one before. What could
     not be sent is tried again with the next message.
     """
 
-    def __init__(self, watch: Watch, settings: Notices) -> None:
+    def __init__(self, watch: FleetWatch, settings: Notices) -> None:
         self.fault = ""
         self._watch = watch
         self._targets: list[Callable[[Sequence[Notice]], None]] = [

@@ -25,7 +25,7 @@ class PictureError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class ImageKind:
     """Type of the content, and size in points."""
 
     media_type: str
@@ -33,7 +33,7 @@ class Picture:
     height: int
 
 
-def picture_of(data: bytes) -> Picture:
+def picture_of(data: bytes) -> ImageKind:
     """What the header of a PNG or JPEG says. Raises PictureError for all else, and where it has too many points."""
     if data.startswith(_PNG):
         found = _png(data)
@@ -51,7 +51,7 @@ def picture_of(data: bytes) -> Picture:
     return found
 
 
-def _png(data: bytes) -> Picture:
+def _png(data: bytes) -> ImageKind:
     header = data[len(_PNG) : len(_PNG) + 8 + _SIZE_OF_IHDR + 4]
     content, crc = header[4:-4], header[-4:]
     if len(header) < 25 or header[:4] != _SIZE_OF_IHDR.to_bytes(4, "big") or content[:4] != b"IHDR":
@@ -60,10 +60,10 @@ def _png(data: bytes) -> Picture:
     known = depth in _BIT_DEPTHS.get(colour, ()) and (compression, filtering) == (0, 0) and interlace < 2
     if zlib.crc32(content) != int.from_bytes(crc, "big") or not known:
         raise PictureError("the header of the PNG is damaged; save it again")
-    return Picture("image/png", int.from_bytes(content[4:8], "big"), int.from_bytes(content[8:12], "big"))
+    return ImageKind("image/png", int.from_bytes(content[4:8], "big"), int.from_bytes(content[8:12], "big"))
 
 
-def _jpeg(data: bytes) -> Picture:
+def _jpeg(data: bytes) -> ImageKind:
     at = 2
     while at + 4 <= len(data):
         if data[at] != 0xFF:
@@ -76,7 +76,7 @@ def _jpeg(data: bytes) -> Picture:
             break
         if code in _FRAMES:
             height, width = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
-            return Picture("image/jpeg", width, height)
+            return ImageKind("image/jpeg", width, height)
         length = int.from_bytes(data[at + 2 : at + 4], "big")
         if length < 2:
             break

@@ -13,12 +13,12 @@ from starlette.responses import JSONResponse, Response
 
 from agent.config.files import read_file
 from agent.delivery.keys import CHUNK
-from agent.monitor.engines import Engine
+from agent.monitor.engines import DatabaseEngine
 from agent.monitor.fleet import SENSORS_MAX
 from agent.monitor.login import Access, body_of
 from agent.monitor.pictures import PictureError, picture_of
 from agent.monitor.rights import PLAN
-from agent.monitor.settings import PICTURES, Plan
+from agent.monitor.settings import PICTURES, FloorPlan
 
 LARGEST_PICTURE = 8_000_000  # bytes
 LARGEST_CONFIGURED = 32 << 20
@@ -45,7 +45,7 @@ class Plans:
     The engine has the tables of Database already. Raises sqlite3.Error or DatabaseError where it cannot be used.
     """
 
-    def __init__(self, engine: Engine, access: Access, configured: Plan | None = None) -> None:
+    def __init__(self, engine: DatabaseEngine, access: Access, configured: FloorPlan | None = None) -> None:
         self._engine, self._access, self._configured = engine, access, configured
         with engine.transaction() as run:
             engine.make_tables(run, [statement.format(bytes=engine.BYTES) for statement in _TABLES])

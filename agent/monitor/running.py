@@ -25,7 +25,7 @@ from agent.monitor.following import Following
 from agent.monitor.forwarding import Forwarding
 from agent.monitor.live import Live
 from agent.monitor.login import Access
-from agent.monitor.notices import Notifier, Watch
+from agent.monitor.notices import FleetWatch, NoticeSender
 from agent.monitor.plan import Plans
 from agent.monitor.server import application
 from agent.monitor.settings import MonitorSettings
@@ -36,7 +36,7 @@ GRACE_S = 2  # s in which answers on their way may end at Ctrl-C
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bus:
+class BusAccess:
     """Routers, the files of a consumer (`tls`) and of a commander, and the list of known keys."""
 
     endpoints: Sequence[str]
@@ -68,7 +68,7 @@ class _Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings: MonitorSettings) -> None:
+def serve(listening: socket.socket, data_dir: Path, bus: BusAccess, web: Web, settings: MonitorSettings) -> None:
     """Serve the page on a socket that listens, until Ctrl-C or SIGTERM.
 
     Raises EndpointError, KeyFileError, UsersError, or sqlite3.Error or DatabaseError where the database cannot
@@ -87,7 +87,7 @@ def serve(listening: socket.socket, data_dir: Path, bus: Bus, web: Web, settings
         stack.callback(following.close)
         notifier = None
         if settings.notices is not None:
-            notifier = Notifier(Watch(fleet, settings.notices, _certificates(bus, web)), settings.notices)
+            notifier = NoticeSender(FleetWatch(fleet, settings.notices, _certificates(bus, web)), settings.notices)
             stack.callback(notifier.close)
         app = application(database, fleet, following, access, forwarding, live, stopping, plans, web.names, notifier)
         server, bounded = web_server(app, listening, web, stopping)
@@ -112,7 +112,7 @@ def web_server(
     return _Server(config, stopping), connections.listening(listening)
 
 
-def _certificates(bus: Bus, web: Web) -> list[Path]:
+def _certificates(bus: BusAccess, web: Web) -> list[Path]:
     """The certificates of this monitor whose end is told."""
     named = [name for files in (bus.tls, bus.commander) if files is not None for name in (files.ca, files.certificate)]
     return [Path(name) for name in dict.fromkeys(named)] + ([web.certificate] if web.certificate is not None else [])

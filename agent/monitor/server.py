@@ -31,7 +31,7 @@ from agent.monitor.forwarding import Forwarding
 from agent.monitor.guard import Guard
 from agent.monitor.live import Live
 from agent.monitor.login import Access
-from agent.monitor.notices import Notifier
+from agent.monitor.notices import NoticeSender
 from agent.monitor.plan import Plans
 from agent.monitor.trends import Trends
 from agent.terminal.text import no_formula
@@ -62,7 +62,7 @@ def application(
     stopping: threading.Event,
     plans: Plans,
     names: Sequence[str] = (),
-    notifier: Notifier | None = None,
+    notifier: NoticeSender | None = None,
 ) -> ASGIApp:
     """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
 
@@ -121,7 +121,7 @@ class _Data:
 
     def __init__(
         self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event,
-        notifier: Notifier | None,
+        notifier: NoticeSender | None,
     ) -> None:  # fmt: skip
         self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
         self._notifier = notifier

@@ -46,7 +46,7 @@ def _mail_address(text: str) -> str:
 MailAddress = Annotated[str, AfterValidator(_mail_address)]
 
 
-class Plan(Section):
+class FloorPlan(Section):
     """A picture, and where sensors (`<site>/<gateway>/<sensor>`) are on it: fractions of its width and height."""
 
     picture: Annotated[Path, AfterValidator(_picture)]
@@ -99,7 +99,7 @@ class MonitorSettings(Section):
     """The whole file."""
 
     database: DatabaseSettings = DatabaseSettings()
-    plan: Plan | None = None
+    plan: FloorPlan | None = None
     notices: Notices | None = None
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from agent.monitor.engines import LASTING, DatabaseError, Run
+from agent.monitor.engines import LASTING, DatabaseError, QueryRunner
 
 FULL_DAYS = 7  # days for which every result is kept in full
 # Results of these kinds come by schedule. All others (status, drift verdicts, kinds of a newer version) stay in full.
@@ -60,7 +60,7 @@ class Summariser:
                 more = False
 
 
-def summarise(run: Run, day: int, sensor: int) -> None:
+def summarise(run: QueryRunner, day: int, sensor: int) -> None:
     """Count the results of a sensor on a day by the hour, and set apart what stays of them."""
     names, of = ", ".join(COUNTS), {"sensor": sensor, "day": day}
     run(

@@ -16,7 +16,7 @@ SERIALS = {"ros2msg": "cdr", "ros1msg": "ros1"}
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class BagChannel:
     """What one publisher sent: its topic, the type of the messages, and how they are defined and serialized.
 
     `language`: of the definition, a key of SERIALS where it can be read.
@@ -41,7 +41,7 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class BagMessage:
     """One message: its channel, when it was recorded and published, in ns since 1970, and its bytes."""
 
     channel: int
@@ -58,17 +58,17 @@ class Bag(ABC):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.channels: dict[int, Channel] = {}
+        self.channels: dict[int, BagChannel] = {}
         self.said: list[str] = []
 
     @abstractmethod
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[BagMessage]:
         """Yield the messages as they stand in the file. A file that was cut is read up to the cut. Raises TableError.
 
         The channel of each message is in `channels`; messages of a channel that is not declared are counted in `said`.
         """
 
-    def declare(self, number: int, channel: Channel) -> None:
+    def declare(self, number: int, channel: BagChannel) -> None:
         """Add a channel. Raises TableError where there are more than any bag has."""
         if len(self.channels) >= MOST_CHANNELS and number not in self.channels:
             raise TableError(f"{self.path}: the file has more than {MOST_CHANNELS} channels; record fewer topics")

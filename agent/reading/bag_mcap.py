@@ -17,7 +17,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from agent.config.files import open_file
-from agent.reading.bag import MOST_CHANNELS, MOST_DEFINITION, Bag, Channel, Message
+from agent.reading.bag import MOST_CHANNELS, MOST_DEFINITION, Bag, BagChannel, BagMessage
 from agent.reading.source import TableError
 from agent.recording.limits import BYTES_PER_MESSAGE, CHUNK_LIMIT, MESSAGES_FIXED, most_unpacked
 from agent.recording.records import MAGIC, record_name
@@ -42,7 +42,7 @@ class _FaultError(Exception):
 class McapBag(Bag):
     """A bag in MCAP."""
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[BagMessage]:
         """Yield the messages. Raises TableError."""
         self.said, unknown = [], 0
         schemas: dict[int, tuple[str, str, str]] = {}
@@ -57,7 +57,7 @@ class McapBag(Bag):
                         raise _FaultError(at, opcode, f"{len(body)} bytes are too short for a message")
                     number, _, log_time_ns, publish_time_ns = _MESSAGE.unpack_from(body)
                     if number in self.channels:
-                        yield Message(number, log_time_ns, publish_time_ns, bytes(body[_MESSAGE.size :]))
+                        yield BagMessage(number, log_time_ns, publish_time_ns, bytes(body[_MESSAGE.size :]))
                     else:
                         unknown += 1
             except _FaultError as fault:
@@ -85,7 +85,7 @@ class McapBag(Bag):
             else:
                 number, schema = struct.unpack_from("<HH", body)
                 topic, serial = _texts(body, 4, 2)
-                self.declare(number, Channel(topic, *schemas.get(schema, ("", "", "")), serial))
+                self.declare(number, BagChannel(topic, *schemas.get(schema, ("", "", "")), serial))
         except struct.error:
             raise _FaultError(at, opcode, "the lengths in it do not agree with its size") from None
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import BinaryIO
 
 from agent.config.files import open_file
-from agent.reading.bag import MOST_DEFINITION, Bag, Channel, Message
+from agent.reading.bag import MOST_DEFINITION, Bag, BagChannel, BagMessage
 from agent.reading.source import TableError
 from agent.recording.limits import BYTES_PER_MESSAGE, CHUNK_LIMIT, MESSAGES_FIXED, most_unpacked
 
@@ -34,7 +34,7 @@ class _FaultError(Exception):
 class Ros1Bag(Bag):
     """A bag of ROS 1."""
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[BagMessage]:
         """Yield the messages. Raises TableError."""
         self.said, unknown, index_at = [], 0, 0
         with open_file(self.path) as file:
@@ -50,7 +50,7 @@ class Ros1Bag(Bag):
                         self._connected(number, header, _fields(at, body))
                     elif kind == MESSAGE and number in self.channels and len(header.get(b"time", b"")) == 8:
                         seconds, ns = struct.unpack("<II", header[b"time"])
-                        yield Message(number, 10**9 * seconds + ns, 10**9 * seconds + ns, body)
+                        yield BagMessage(number, 10**9 * seconds + ns, 10**9 * seconds + ns, body)
                     else:
                         unknown += kind == MESSAGE
                 if index_at <= 0:
@@ -63,7 +63,7 @@ class Ros1Bag(Bag):
         """Keep a connection as a channel."""
         texts = [header.get(b"topic", b""), told.get(b"type", b""), told.get(b"message_definition", b"")]
         topic, kind, definition = (text[:MOST_DEFINITION].decode("utf-8", "replace") for text in texts)
-        self.declare(number, Channel(topic, kind, "ros1msg", definition, "ros1"))
+        self.declare(number, BagChannel(topic, kind, "ros1msg", definition, "ros1"))
 
     def _ended(self, size: int, index_at: int, fault: _FaultError) -> None:
         """Say that the file is cut, or raise TableError where it is damaged: its index is in it."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from urllib.parse import quote
 
-from agent.reading.bag import MOST_DEFINITION, Bag, Channel, Message
+from agent.reading.bag import MOST_DEFINITION, Bag, BagChannel, BagMessage
 from agent.reading.source import TableError
 
 LONGEST = 1 << 27  # bytes of a message
@@ -19,7 +19,7 @@ LONGEST = 1 << 27  # bytes of a message
 class SqliteBag(Bag):
     """A bag in SQLite."""
 
-    def messages(self) -> Iterator[Message]:
+    def messages(self) -> Iterator[BagMessage]:
         """Yield the messages in the order in which they were written. Raises TableError."""
         self.said, unknown, count = [], 0, 0
         self._say_log()
@@ -31,7 +31,7 @@ class SqliteBag(Bag):
                 for number, time_ns, data in self._rows(file):
                     count += 1
                     if number in self.channels and isinstance(time_ns, int) and isinstance(data, bytes):
-                        yield Message(number, time_ns, time_ns, data)
+                        yield BagMessage(number, time_ns, time_ns, data)
                     else:
                         unknown += 1
         except (sqlite3.Error, OverflowError) as error:
@@ -67,7 +67,7 @@ class SqliteBag(Bag):
             known = {str(kind): (str(language), str(text)) for kind, language, text in rows}
         for number, topic, kind, serial in file.execute("SELECT id, name, type, serialization_format FROM topics"):
             language, definition = known.get(str(kind), ("ros2msg", ""))
-            self.declare(number, Channel(str(topic), str(kind), language, definition, str(serial)))
+            self.declare(number, BagChannel(str(topic), str(kind), language, definition, str(serial)))
 
     def _rows(self, file: sqlite3.Connection) -> Iterator[tuple[int, int, bytes]]:
         """Yield the rows of the messages. Raises sqlite3.Error at a cut, TableError where the file cannot hold them."""

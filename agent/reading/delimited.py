@@ -26,7 +26,7 @@ from agent.reading.dialect import (
     SAMPLE_ROWS,
     Dialect,
     MixedMarksError,
-    Part,
+    TableColumn,
     dialect_of_text,
     lines_of,
     names_time,
@@ -80,7 +80,7 @@ class Delimited(Source):
             return
         counter = next((part for part in parts.values() if COUNTERS & set(words(part.name) or [part.name])), None)
         self._parts = {
-            Column(COUNTED): replace(counter, name=COUNTED) if counter else Part(COUNTED, "", (), ()),
+            Column(COUNTED): replace(counter, name=COUNTED) if counter else TableColumn(COUNTED, "", (), ()),
             **parts,
         }
         self.counted = COUNTED
@@ -179,7 +179,7 @@ class Delimited(Source):
         return np.array(parsed).reshape(-1, len(places))
 
 
-def _sum(part: Part, rows: Array, places: Sequence[int], first: int) -> Array:
+def _sum(part: TableColumn, rows: Array, places: Sequence[int], first: int) -> Array:
     """The values of a column: the sum of its fields; without fields the number of the row."""
     if not part.places:
         return np.arange(first, first + len(rows), dtype=float)

@@ -61,7 +61,7 @@ class MixedMarksError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class TableColumn:
     """A column of the table: its name and unit, and the places of the fields whose sum it is.
 
     A date and a time of day in two columns are one, and so are a time of day and its ms. `per`: what one unit of each
@@ -92,7 +92,7 @@ class Dialect:
     units: tuple[str, ...]
     first_line: int
     moments: tuple[str, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[TableColumn, ...]
     order: str = ""
     rate_hz: float | None = None
     fortran: bool = False
@@ -180,7 +180,7 @@ def dialect_of_text(text: Text, order: str = "") -> Dialect:
     delimiter = max(DELIMITERS[:4], key=line.count)
     header = tuple(_fields(line, delimiter))
     nothing = ("",) * len(header)
-    parts = tuple(Part(name, "", (k,), (1.0,)) for k, name in enumerate(header) if name)
+    parts = tuple(TableColumn(name, "", (k,), (1.0,)) for k, name in enumerate(header) if name)
     return Dialect(text.encoding, delimiter, nothing, header, number, nothing, number + 1, nothing, parts)
 
 
@@ -317,10 +317,10 @@ def _moments(cells: Sequence[str]) -> str:
 
 def _parts(
     header: Sequence[str], units: Sequence[str], moments: Sequence[str], cells: Sequence[Sequence[str]]
-) -> tuple[Part, ...]:
+) -> tuple[TableColumn, ...]:
     """The columns of the table. A moment is called "time" where no name tells a time."""
     with_clock = _clocks_of_days(moments)
-    parts: dict[int, Part] = {}
+    parts: dict[int, TableColumn] = {}
     for k, name in enumerate(header):
         places, per = [k], [1.0]
         if k in with_clock.values():
@@ -329,17 +329,17 @@ def _parts(
         if moments[k] in ("clock", "both") and _counts_thousandths(header, cells, k):
             places, per = [*places, k + 1], [*per, 1e-3]
         if k not in with_clock and name and not any(k in part.places for part in parts.values()):
-            parts[k] = Part(name, "s" if moments[k] else units[k], tuple(places), tuple(per))
+            parts[k] = TableColumn(name, "s" if moments[k] else units[k], tuple(places), tuple(per))
     return tuple(_with_time(parts, moments).values())
 
 
-def _with_time(parts: dict[int, Part], moments: Sequence[str]) -> dict[int, Part]:
+def _with_time(parts: dict[int, TableColumn], moments: Sequence[str]) -> dict[int, TableColumn]:
     """The parts; the only moment among them is called "time" where no name tells a time."""
     told = [k for k, part in parts.items() if part.unit == "s" and moments[k]]
     if len(told) != 1 or any(names_time(part.name) for part in parts.values()):
         return parts
     only = parts[told[0]]
-    return parts | {told[0]: Part("time", only.unit, only.places, only.per)}
+    return parts | {told[0]: TableColumn("time", only.unit, only.places, only.per)}
 
 
 def _clocks_of_days(moments: Sequence[str]) -> dict[int, int]:

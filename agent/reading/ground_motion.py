@@ -12,7 +12,7 @@ import numpy as np
 
 from agent.reading.seismic import MiniSeed
 from agent.reading.source import Array, Arrays, Column, Grid, Stretches, TableError
-from agent.reading.stationxml import CONSISTENT, Component, StationXml
+from agent.reading.stationxml import CONSISTENT, StationChannel, StationXml
 from calib.model import Slices
 
 Role = Literal["sensor", "reference"]
@@ -33,7 +33,7 @@ class GroundMotion(Arrays):
     """
 
     def __init__(self, source: MiniSeed, station: StationXml, role: Role) -> None:
-        self.components: dict[Column, Component] = {}
+        self.components: dict[Column, StationChannel] = {}
         self.said: list[str] = [*source.said]
         values: dict[Column, Slices] = {}
         faults: list[TableError] = []
@@ -47,7 +47,7 @@ class GroundMotion(Arrays):
         super().__init__(source.path, values)
 
     def _each(
-        self, names: Sequence[str], group: str, found: Sequence[Component], flat: Sequence[Flat]
+        self, names: Sequence[str], group: str, found: Sequence[StationChannel], flat: Sequence[DeconvolvedSamples]
     ) -> dict[Column, Slices]:
         """Each channel by itself as an acceleration."""
         samples: dict[Column, Slices] = {}
@@ -68,7 +68,9 @@ class GroundMotion(Arrays):
             for component in found
             if abs(component.inconsistent) > CONSISTENT
         ]
-        flat = [Flat(source.values[c], grid.rate_hz, each) for c, each in zip(columns, found, strict=True)]
+        flat = [
+            DeconvolvedSamples(source.values[c], grid.rate_hz, each) for c, each in zip(columns, found, strict=True)
+        ]
         if role == "sensor":
             names = _axes(found) if len(found) == len(AXES) else [c.name for c in columns]
             told = {Column(n, "counts", time.group): (f, c) for n, f, c in zip(names, flat, found, strict=True)}
@@ -86,10 +88,10 @@ class GroundMotion(Arrays):
         return whole
 
 
-class Flat:
+class DeconvolvedSamples:
     """Samples (n,) with the response taken out, and differentiated to the acceleration; NaN where there are none."""
 
-    def __init__(self, values: Slices, rate_hz: float, component: Component) -> None:
+    def __init__(self, values: Slices, rate_hz: float, component: StationChannel) -> None:
         self._values, self._rate_hz, self._component = values, rate_hz, component
 
     def __len__(self) -> int:
@@ -111,7 +113,7 @@ class Flat:
 class Sum:
     """A weighted sum of samples (n,)."""
 
-    def __init__(self, parts: Sequence[Flat], weights: Sequence[float]) -> None:
+    def __init__(self, parts: Sequence[DeconvolvedSamples], weights: Sequence[float]) -> None:
         self._parts, self._weights = parts, weights
 
     def __len__(self) -> int:
@@ -122,7 +124,7 @@ class Sum:
         return np.asarray(np.sum(parts, axis=0))
 
 
-def flattened(counts: Array, rate_hz: float, component: Component) -> Array:
+def flattened(counts: Array, rate_hz: float, component: StationChannel) -> Array:
     """`counts` (n,) as an instrument of the same sensitivity would give them that responds alike at all frequencies
     and measures acceleration.
 
@@ -143,7 +145,7 @@ def flattened(counts: Array, rate_hz: float, component: Component) -> Array:
     return whole + line / component.real[0] if component.feels_gravity and component.real else whole
 
 
-def _inverse(f: Array, component: Component) -> Array:
+def _inverse(f: Array, component: StationChannel) -> Array:
     """1 / h at the frequencies `f` (n,)."""
     if not component.real:
         return np.ones(len(f), complex)
@@ -156,14 +158,14 @@ def _inverse(f: Array, component: Component) -> Array:
     return np.asarray(gain * np.exp(-1j * phase))
 
 
-def _axes(found: Sequence[Component]) -> list[str]:
+def _axes(found: Sequence[StationChannel]) -> list[str]:
     """The names of three channels: x is that which points most to the east or west, y north or south, z up or down."""
     along = np.abs([c.direction for c in found])
     best = max(itertools.permutations(range(3)), key=lambda axes: sum(along[k, axis] for k, axis in enumerate(axes)))
     return [AXES[axis] for axis in best]
 
 
-def _turned(station: StationXml, found: Sequence[Component]) -> Array:
+def _turned(station: StationXml, found: Sequence[StationChannel]) -> Array:
     """The matrix (3, 3) that turns what three channels measure to east, north and up."""
     directions = np.array([c.direction for c in found])
     if np.linalg.svd(directions, compute_uv=False)[-1] < LEAST_RANK:

@@ -19,7 +19,7 @@ FEWEST_ROWS = 2
 RATES = ("fs", "rate_hz", "sample_rate", "samplerate", "sampling_rate", "fsamp")  # names of a sampling rate in Hz
 
 
-class Part:
+class DatasetColumn:
     """One column of a data set of two dimensions; the longer one counts the samples."""
 
     def __init__(self, data: Any, column: int) -> None:
@@ -80,8 +80,12 @@ def columns_of(name: str, data: Any, unit: str = "", group: str = "") -> dict[Co
         return {Column(name, unit, group): data}
     width = min(data.shape)
     if width == 1:
-        return {Column(name, unit, group): Part(data, 0)}
-    return {Column(f"{name}[{k}]", unit, group): Part(data, k) for k in range(width)} if width <= MOST_COLUMNS else {}
+        return {Column(name, unit, group): DatasetColumn(data, 0)}
+    return (
+        {Column(f"{name}[{k}]", unit, group): DatasetColumn(data, k) for k in range(width)}
+        if width <= MOST_COLUMNS
+        else {}
+    )
 
 
 def with_times(values: dict[Column, Slices], rates: dict[str, float]) -> dict[Column, Slices]:

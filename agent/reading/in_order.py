@@ -22,7 +22,7 @@ MOST_CHANGES = 20  # of the run, for each long run, where runs only overlap at t
 TIME, LOGGED, CHECK = 0, -2, -1  # columns
 
 
-class Stream:
+class PublisherStream:
     """The messages of one publisher on disk. A row: its time in s, its numbers, when it was recorded, and a checksum.
 
     `moved`: messages that do not stand in the order of their times; `doubled`: messages that are there again. Both are

@@ -21,7 +21,7 @@ LONGEST_HOLE_S = 10.0  # a longer one is left to the time stamps
 HOLES_MAX = 1_000_000  # rows of all holes; more only up to ten times the samples before, the rest is left to the stamps
 
 
-class Recording(Source):
+class RecordingSource(Source):
     """A recording. Each device is a group with `time_s`, its axes and, where it has one, `temperature_degc`.
 
     The time is the arrival of the burst to which a sample belongs, in s since 1970. Lost samples that the device
@@ -140,7 +140,7 @@ def open_mcap(path: Path) -> Source:
     """Open a recording of this program, or of ROS 2. Raises TableError."""
     start = first_event(path)
     if start is not None:
-        return Recording(path, start)
+        return RecordingSource(path, start)
     from agent.reading.ros2 import RosBag
 
     return RosBag(path)

@@ -14,11 +14,11 @@ import numpy as np
 import zstandard
 
 from agent.config.files import open_file
-from agent.reading.bag import Bag, Channel, Message
+from agent.reading.bag import Bag, BagChannel, BagMessage
 from agent.reading.bag_mcap import McapBag
 from agent.reading.bag_ros1 import Ros1Bag
 from agent.reading.bag_sqlite import SqliteBag
-from agent.reading.in_order import Stream
+from agent.reading.in_order import PublisherStream
 from agent.reading.mapping import TIMES, Topic
 from agent.reading.ros2_fields import BIG, FieldError, Fields, plain, read_definition
 from agent.reading.source import ROWS_AT_ONCE, Array, Column, Progress, Source, TableError
@@ -185,7 +185,7 @@ class RosBag(Source):
             raise TableError(f"{self.path}: the columns belong to several topics; add group=NAME of one topic")
         names = [column.name for column in self._topics[name].columns(name)]
         places = [names.index(column.name) for column in columns]
-        stream = Stream(len(names))
+        stream = PublisherStream(len(names))
         for rows in self._rows(name):
             stream.append(rows)
         for rows in stream.rows():
@@ -201,7 +201,7 @@ class RosBag(Source):
             progress(self.path.stat().st_size)
 
     def _rows(self, name: str) -> Iterator[Array]:
-        """Yield the messages of one publisher as they stand in the file, as rows of `Stream`."""
+        """Yield the messages of one publisher as they stand in the file, as rows of `PublisherStream`."""
         clock, fields, (number, frame) = self._topics[name].time, self._fields[name], self._senders[name]
         channel = self._bag.channels[number]
         rows: list[list[float]] = []
@@ -232,7 +232,7 @@ def _bag_of(path: Path) -> Bag:
     return BAGS.get(begin, McapBag)(path)
 
 
-def _frame(channel: Channel, message: Message) -> bytes:
+def _frame(channel: BagChannel, message: BagMessage) -> bytes:
     """The frame in the header with which a message begins; b"" where it begins otherwise."""
     if not channel.is_read or not (_HEADER_FIRST.match(channel.definition) or plain(channel.kind) == IMU):
         return b""
@@ -245,7 +245,7 @@ def _frame(channel: Channel, message: Message) -> bytes:
     return data[FRAME_AT + 4 : FRAME_AT + 4 + min(length, LONGEST_FRAME)].rstrip(b"\0")
 
 
-def _unpacked(message: Message) -> bytes:
+def _unpacked(message: BagMessage) -> bytes:
     """The bytes of a message, which rosbag2 can have compressed each by itself. Raises FieldError."""
     if not message.data.startswith(ZSTD_BEGINS):
         return message.data

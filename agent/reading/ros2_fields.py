@@ -107,7 +107,7 @@ class Fields:
 
     def __init__(self, root: str, types: Types, paths: Sequence[str], serial: str = "cdr") -> None:
         self._root, self._types, self._paths = root, types, paths
-        self._reader = _Ros1 if serial == "ros1" else _Cdr
+        self._reader = _Ros1 if serial == "ros1" else _CdrReader
         self._wanted: dict[Any, Any] = {}
         for column, path in enumerate(paths):
             self._want(path, column)
@@ -162,7 +162,7 @@ class Fields:
         return values
 
 
-class _Cdr:
+class _CdrReader:
     """One message. Numbers are aligned to their size, counted from the fifth byte."""
 
     def __init__(self, data: bytes, types: Types, values: list[float]) -> None:
@@ -233,7 +233,7 @@ class _Cdr:
             raise IndexError
 
 
-class _Ros1(_Cdr):
+class _Ros1(_CdrReader):
     """One message of ROS 1: nothing is aligned."""
 
     def __init__(self, data: bytes, types: Types, values: list[float]) -> None:

@@ -24,7 +24,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class SeedRecord:
     """A record: `at` and `length` in bytes; `seed_id`: network.station.location.channel; `start_ns` since 1970."""
 
     at: int
@@ -34,7 +34,7 @@ class Record:
     samples: int
 
 
-def records(data: bytes) -> Iterator[Record]:
+def records(data: bytes) -> Iterator[SeedRecord]:
     """Yield the records that begin with a header. What is between them is passed over.
 
     The last one reaches beyond the end of `data` where the file is cut.
@@ -49,7 +49,7 @@ def records(data: bytes) -> Iterator[Record]:
         at = record.at + record.length
 
 
-def _record(data: bytes, at: int) -> Record | None:
+def _record(data: bytes, at: int) -> SeedRecord | None:
     """The record at byte `at`; None where none is."""
     header = data[at + STATION_AT : at + HEADER_BYTES]
     if len(header) < HEADER_BYTES - STATION_AT:
@@ -66,7 +66,7 @@ def _record(data: bytes, at: int) -> Record | None:
     start = datetime(year, 1, 1, hour, minute, tzinfo=UTC) + timedelta(days=day - 1) - EPOCH
     late = 0 if activity & CORRECTED else correction
     start_ns = (start // timedelta(seconds=1) + second) * 10**9 + (fraction + late) * 100_000 + microseconds * 1000
-    return Record(at, length, f"{network}.{station}.{location}.{channel}", start_ns, samples)
+    return SeedRecord(at, length, f"{network}.{station}.{location}.{channel}", start_ns, samples)
 
 
 def _blockettes(data: bytes, at: int, first: int, order: str) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from agent.config.files import open_file
-from agent.reading.seed_records import Record, records
+from agent.reading.seed_records import SeedRecord, records
 from agent.reading.source import Array, Arrays, Column, Grid, Stretches, TableError, check_announced
 from agent.reading.stationxml import import_obspy
 from calib.model import Slices
@@ -42,7 +42,7 @@ class MiniSeed(Arrays):
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class GridRun:
     """Samples of a channel that follow each other on one grid: the time of the first, in s since 1970, and how many."""
 
     start_s: float
@@ -50,14 +50,14 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Component:
+class SeismicTrace:
     """A channel with its samples (n,), and the runs of which they consist, at the rate that their times tell."""
 
     seed_id: str
     stated_hz: float
     rate_hz: float
     data: Array
-    runs: list[Run]
+    runs: list[GridRun]
 
 
 def open_miniseed(path: Path) -> MiniSeed:
@@ -78,7 +78,7 @@ def open_miniseed(path: Path) -> MiniSeed:
         except Exception as error:  # ObsPy raises many kinds for broken files
             reason = " ".join(str(error).split())
             raise TableError(f"{path}: the file cannot be read: {reason}; write it anew") from None
-    groups: dict[str, list[Component]] = {}
+    groups: dict[str, list[SeismicTrace]] = {}
     for component in _components(path, stream, found):
         groups.setdefault(component.seed_id[:-1], []).append(component)
     values: dict[Column, Slices] = {}
@@ -106,7 +106,7 @@ def _bytes(path: Path) -> bytes:
     raise TableError(f"{path}: the file has more than {LARGEST} bytes, so it is not read; split it by time")
 
 
-def _whole_records(path: Path, data: bytes, said: list[str]) -> tuple[list[Record], bytes]:
+def _whole_records(path: Path, data: bytes, said: list[str]) -> tuple[list[SeedRecord], bytes]:
     """The records of the file by channel and time, and their bytes; all of the file where no record is found in it.
 
     `said` gets what is left out: a record that is cut, what is no record, and records that are there twice.
@@ -123,7 +123,7 @@ def _whole_records(path: Path, data: bytes, said: list[str]) -> tuple[list[Recor
     between = stop - sum(record.length for record in found)
     if between and data[6:7] in b"DRQM":  # a full SEED volume begins with headers of other kinds
         said.append(f"{path}: {between} bytes are no records of MiniSEED; they are left out")
-    taken: dict[tuple[str, int, bytes], Record] = {}
+    taken: dict[tuple[str, int, bytes], SeedRecord] = {}
     for record in found:
         taken.setdefault((record.seed_id, record.start_ns, data[record.at + 8 : record.at + record.length]), record)
     if len(taken) < len(found):
@@ -132,9 +132,9 @@ def _whole_records(path: Path, data: bytes, said: list[str]) -> tuple[list[Recor
     return whole, b"".join(data[record.at : record.at + record.length] for record in whole)
 
 
-def _components(path: Path, stream: Any, found: Sequence[Record]) -> Iterator[Component]:
+def _components(path: Path, stream: Any, found: Sequence[SeedRecord]) -> Iterator[SeismicTrace]:
     """Yield the channels of numbers. Raises TableError where one has several rates."""
-    told: dict[str, list[Record]] = {}
+    told: dict[str, list[SeedRecord]] = {}
     for record in found:
         if record.samples:
             told.setdefault(record.seed_id, []).append(record)
@@ -152,7 +152,7 @@ def _components(path: Path, stream: Any, found: Sequence[Record]) -> Iterator[Co
             parts = [(trace.stats.starttime.ns, len(trace.data)) for trace in traces]
         made = [(rate_hz, _runs(parts, rate_hz)) for rate_hz in (stated_hz, _rate(parts, stated_hz))]
         rate_hz, runs = min(made, key=lambda each: len(each[1]))
-        yield Component(seed_id, stated_hz, rate_hz, np.concatenate([trace.data for trace in traces]), runs)
+        yield SeismicTrace(seed_id, stated_hz, rate_hz, np.concatenate([trace.data for trace in traces]), runs)
 
 
 def _agree(parts: Sequence[tuple[int, int]], traces: Sequence[Any]) -> bool:
@@ -183,20 +183,20 @@ def _off_grid_s(rate_hz: float) -> float:
     return min(max(OFF_GRID / rate_hz, FINEST_S), 0.5 / rate_hz)
 
 
-def _runs(parts: Sequence[tuple[int, int]], rate_hz: float) -> list[Run]:
+def _runs(parts: Sequence[tuple[int, int]], rate_hz: float) -> list[GridRun]:
     """The records (start in ns, samples) joined where one follows the other on the grid of this rate."""
     off_s = _off_grid_s(rate_hz)
-    runs: list[Run] = []
+    runs: list[GridRun] = []
     first_ns, count = parts[0]
     for start_ns, samples in parts[1:]:
         if abs(1e-9 * (start_ns - first_ns) - count / rate_hz) > off_s:
-            runs.append(Run(first_ns * 1e-9, count))
+            runs.append(GridRun(first_ns * 1e-9, count))
             first_ns, count = start_ns, 0
         count += samples
-    return [*runs, Run(first_ns * 1e-9, count)]
+    return [*runs, GridRun(first_ns * 1e-9, count)]
 
 
-def _rows(path: Path, group: str, components: Sequence[Component], said: list[str]) -> tuple[Slices, list[Array]]:
+def _rows(path: Path, group: str, components: Sequence[SeismicTrace], said: list[str]) -> tuple[Slices, list[Array]]:
     """The times of the rows of a group, and each component's samples in them, NaN where it has none."""
     rates = {component.stated_hz for component in components}
     if len(rates) > 1:
@@ -214,7 +214,7 @@ def _rows(path: Path, group: str, components: Sequence[Component], said: list[st
     return (Grid(times.starts_s[0], longest.rate_hz, len(times)) if len(times.firsts) == 1 else times), rows
 
 
-def _times(longest: Component, components: Sequence[Component]) -> Stretches:
+def _times(longest: SeismicTrace, components: Sequence[SeismicTrace]) -> Stretches:
     """The times of the rows: those of the longest component, and before and after it those of the others.
 
     A hole of up to LONGEST_HOLE_S has as many rows as samples are missing, a longer one has one.
@@ -238,7 +238,7 @@ def _times(longest: Component, components: Sequence[Component]) -> Stretches:
     return Stretches(rate_hz, at + runs[-1].samples + after, tuple(firsts), tuple(starts_s), tuple(periods_s))
 
 
-def _placed(component: Component, times: Stretches) -> tuple[Array, int]:
+def _placed(component: SeismicTrace, times: Stretches) -> tuple[Array, int]:
     """The samples in the rows of their times, and how many have no row. Where two differ in one row, none is taken."""
     whole = np.full(len(times), np.nan)
     data, lost = component.data, 0

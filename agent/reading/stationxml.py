@@ -27,7 +27,7 @@ SECONDS_ALLOWED = 300.0  # for reading one file
 CONSISTENT = 0.02  # relative: the stages of a response and its overall sensitivity
 
 
-class Component(msgspec.Struct, frozen=True):
+class StationChannel(msgspec.Struct, frozen=True):
     """A channel as its StationXML describes it.
 
     `seed_id`: network.station.location.channel. `from_s`, `to_s`: when it holds, s since 1970. `unit`: of the ground
@@ -75,9 +75,9 @@ class StationXml:
     """A StationXML. `components`: of all its channels, each for its time."""
 
     path: Path
-    components: tuple[Component, ...]
+    components: tuple[StationChannel, ...]
 
-    def component(self, seed_id: str, start_s: float, rate_hz: float) -> Component:
+    def component(self, seed_id: str, start_s: float, rate_hz: float) -> StationChannel:
         """The channel that holds at the time `start_s`. Raises TableError where there is none that can be used."""
         same = [c for c in self.components if c.seed_id == seed_id]
         found = next((c for c in same if c.from_s <= start_s < c.to_s), None)
@@ -119,13 +119,13 @@ def read_stationxml(path: Path) -> StationXml:
 
 
 @lru_cache(maxsize=1)  # one file often describes both instruments
-def _components(data: bytes) -> tuple[Component, ...]:
+def _components(data: bytes) -> tuple[StationChannel, ...]:
     """The channels in a StationXML. Raises ValueError and subprocess.TimeoutExpired."""
     command = [sys.executable, "-m", "agent.reading.stationxml"]
     done = subprocess.run(command, input=data, capture_output=True, check=False, timeout=SECONDS_ALLOWED)
     if done.returncode:
         raise ValueError(done.stderr.decode("utf-8", "replace").strip().rpartition("\n")[2] or "its reader failed")
-    return tuple(msgspec.json.decode(done.stdout, type=list[Component]))
+    return tuple(msgspec.json.decode(done.stdout, type=list[StationChannel]))
 
 
 def import_obspy() -> Any:
@@ -150,10 +150,10 @@ def main() -> None:
     sys.stdout.buffer.write(msgspec.json.encode(found))
 
 
-def _component(seed_id: str, channel: Any) -> Component:
+def _component(seed_id: str, channel: Any) -> StationChannel:
     from_s = channel.start_date.timestamp if channel.start_date else 0.0
     to_s = channel.end_date.timestamp if channel.end_date else LARGEST_TIME_S
-    nothing = Component(seed_id, from_s, to_s)
+    nothing = StationChannel(seed_id, from_s, to_s)
     try:
         return _described(nothing, channel)
     except ValueError as error:
@@ -162,12 +162,12 @@ def _component(seed_id: str, channel: Any) -> Component:
         return _unusable(nothing, f"the response cannot be computed: {str(error).partition(chr(10))[0]}")
 
 
-def _unusable(component: Component, reason: str) -> Component:
+def _unusable(component: StationChannel, reason: str) -> StationChannel:
     """The component, which cannot be used for this reason."""
     return msgspec.structs.replace(component, reason=reason)
 
 
-def _described(component: Component, channel: Any) -> Component:
+def _described(component: StationChannel, channel: Any) -> StationChannel:
     """The component with what the channel states. Raises ValueError with the reason where it states too little."""
     total = channel.response.instrument_sensitivity if channel.response else None
     if total is None or not total.value or not math.isfinite(total.value):

@@ -13,7 +13,7 @@ from agent.reading.source import Array, Arrays, Column, Grid, TableError
 from calib.model import Slices
 
 
-class Dates:
+class TimeStamps:
     """A channel of time stamps, in s since 1970."""
 
     def __init__(self, channel: Any) -> None:
@@ -53,7 +53,7 @@ def _columns(file: Any) -> dict[Column, Slices]:
                 if "wf_increment" in channel.properties:
                     values.setdefault(Column("time_s", "s", group.name), _times(channel))
             elif len(channel) and kind == "M":
-                values[Column(channel.name, "s", group.name)] = Dates(channel)
+                values[Column(channel.name, "s", group.name)] = TimeStamps(channel)
     return values
 
 

@@ -20,7 +20,7 @@ TYPES = {(PCM, 8): "u1", (PCM, 16): "<i2", (PCM, 32): "<i4", (FLOAT, 32): "<f4",
 FULL_SCALE = {8: 128.0, 16: 2.0**15, 24: 2.0**23, 32: 2.0**31}
 
 
-class Channel:
+class WavChannel:
     """One channel of frames on disk, as floating-point numbers: integers divided by full scale."""
 
     def __init__(self, frames: NDArray[np.generic], channel: int, bits: int, kind: int) -> None:
@@ -81,4 +81,4 @@ def open_wav(path: Path) -> Arrays:
     shape: tuple[int, ...] = (samples, channels, 3) if bits == 24 else (samples, channels)
     frames = np.memmap(path, TYPES.get((kind, bits), "u1"), "r", data[0], shape)
     values: dict[Column, Slices] = {Column("time_s", "s"): Grid(0.0, float(rate_hz), samples)}
-    return Arrays(path, values | {Column(f"ch{k + 1}"): Channel(frames, k, bits, kind) for k in range(channels)})
+    return Arrays(path, values | {Column(f"ch{k + 1}"): WavChannel(frames, k, bits, kind) for k in range(channels)})

@@ -17,7 +17,7 @@ from agent.recording.pruned_ranges import Deleted, first_outside, merged
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class ChainLink:
     """The properties of one recording that must agree with the recording before it and the one after it."""
 
     path: str
@@ -39,7 +39,7 @@ class Link:
 
 
 def chain_faults(
-    links: Sequence[Link], statements: Sequence[Deleted] = (), *, whole: bool
+    links: Sequence[ChainLink], statements: Sequence[Deleted] = (), *, whole: bool
 ) -> Iterator[tuple[int, str]]:
     """Yield (index in `links`, what is wrong) for each recording that does not follow the one before it.
 
@@ -54,7 +54,7 @@ def chain_faults(
         return
     yield from _gaps(order, _union([*_entries(links), *statements]), whole=whole)
     yield from _results(order)
-    said = _Said(order, statements)
+    said = _RecordedStatements(order, statements)
     yield from said.contradictions()
     yield from said.strangers()
     for index, link in order:
@@ -63,7 +63,7 @@ def chain_faults(
                 yield index, f"it says that recording {entry.last} was deleted, which does not come before it"
 
 
-def unproven(links: Sequence[Link], statements: Sequence[Deleted] = (), *, whole: bool) -> Iterator[str]:
+def unproven(links: Sequence[ChainLink], statements: Sequence[Deleted] = (), *, whole: bool) -> Iterator[str]:
     """Yield what the links cannot show about the order of recordings, a sentence each, for the list `not proven`."""
     order, entries = _in_order(links), _entries(links)
     by_recordings = _union(entries)
@@ -78,7 +78,7 @@ def unproven(links: Sequence[Link], statements: Sequence[Deleted] = (), *, whole
         yield from _unnamed(entries, statements)
 
 
-def missing_after(links: Sequence[Link], expected: int) -> str:
+def missing_after(links: Sequence[ChainLink], expected: int) -> str:
     """The fault where file numbers up to `expected` were used and the highest ones are not there; "" where none is."""
     last = max((link.file_sequence for link in links), default=0)
     return f"{span(last + 1, expected)} missing at the end" if last < expected else ""
@@ -89,10 +89,10 @@ def span(first: int, last: int) -> str:
     return f"recording {first} is" if first == last else f"recordings {first} to {last} are"
 
 
-class _Said:
+class _RecordedStatements:
     """All that is said of recordings: the SHA-256 of recording k, by its number, and the epoch before and after k."""
 
-    def __init__(self, order: Sequence[tuple[int, Link]], statements: Sequence[Deleted]) -> None:
+    def __init__(self, order: Sequence[tuple[int, ChainLink]], statements: Sequence[Deleted]) -> None:
         self._order = order
         self._numbers = [link.number for _, link in order]
         self._sha256: dict[int, dict[tuple[str, str], int]] = {}  # (way, SHA-256): index of the link that says it
@@ -154,12 +154,12 @@ class _Said:
         return self._order[min(bisect_right(self._numbers, number), len(self._order) - 1)][0]
 
 
-def _in_order(links: Sequence[Link]) -> list[tuple[int, Link]]:
+def _in_order(links: Sequence[ChainLink]) -> list[tuple[int, ChainLink]]:
     """(index, link) of the recordings that have a number, by number."""
     return sorted(((i, link) for i, link in enumerate(links) if link.number), key=lambda pair: pair[1].number)
 
 
-def _entries(links: Sequence[Link]) -> list[Deleted]:
+def _entries(links: Sequence[ChainLink]) -> list[Deleted]:
     return sorted({entry for link in links for entry in link.deleted})
 
 
@@ -168,8 +168,10 @@ def _union(entries: Sequence[Deleted]) -> tuple[Deleted, ...]:
     return merged(Deleted(entry.first, entry.last) for entry in entries)
 
 
-def _gaps(order: Sequence[tuple[int, Link]], deleted: Sequence[Deleted], *, whole: bool) -> Iterator[tuple[int, str]]:
-    before: Link | None = None
+def _gaps(
+    order: Sequence[tuple[int, ChainLink]], deleted: Sequence[Deleted], *, whole: bool
+) -> Iterator[tuple[int, str]]:
+    before: ChainLink | None = None
     for index, link in order:
         last = before.number if before is not None else 0
         unsaid = first_outside(deleted, last + 1, link.number - 1)
@@ -190,14 +192,14 @@ def _gaps(order: Sequence[tuple[int, Link]], deleted: Sequence[Deleted], *, whol
         before = link
 
 
-def _results(order: Sequence[tuple[int, Link]]) -> Iterator[tuple[int, str]]:
+def _results(order: Sequence[tuple[int, ChainLink]]) -> Iterator[tuple[int, str]]:
     for (_, before), (index, after) in pairwise(order):
         follows = before.number + 1 == after.number and after.previous_sha256 == before.sha256
         if follows and before.signed_results is not None and after.previous_results not in ("", before.signed_results):
             yield index, f"its chain of results does not begin where the one of {before.path} ends"
 
 
-def _foreign(links: Sequence[Link], *, whole: bool) -> Iterator[tuple[int, str]]:
+def _foreign(links: Sequence[ChainLink], *, whole: bool) -> Iterator[tuple[int, str]]:
     known = [link for link in links if link.gateway]  # a file that cannot be read names none
     remedy = "a directory holds the recordings of one gateway" if whole else "audit those of one gateway together"
     for index, link in enumerate(links):
@@ -206,14 +208,14 @@ def _foreign(links: Sequence[Link], *, whole: bool) -> Iterator[tuple[int, str]]
             yield index, f"{whose}; {remedy}"
 
 
-def _misnamed(links: Sequence[Link]) -> Iterator[tuple[int, str]]:
+def _misnamed(links: Sequence[ChainLink]) -> Iterator[tuple[int, str]]:
     for index, link in enumerate(links):
         if link.file_sequence and file_number(Path(link.path).name) != link.file_sequence:
             yield index, f"its name is not the one of recording {link.file_sequence}, which it holds"
 
 
 def _deleted_ones(
-    order: Sequence[tuple[int, Link]], by_recordings: Sequence[Deleted], statements: Sequence[Deleted]
+    order: Sequence[tuple[int, ChainLink]], by_recordings: Sequence[Deleted], statements: Sequence[Deleted]
 ) -> Iterator[str]:
     numbers = [0, *(link.number for _, link in order)]
     repeated, all_of_them = (_missing(numbers, each) for each in (by_recordings, _union([*by_recordings, *statements])))

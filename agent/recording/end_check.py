@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from agent.recording.chain import Link, span
+from agent.recording.chain import ChainLink, span
 from agent.recording.gone import Gone
 from agent.recording.head import Head
 from agent.recording.reading import open_recording
@@ -79,7 +79,7 @@ class End(msgspec.Struct, kw_only=True):
 
 
 def check_end(
-    heads: Sequence[GivenHead], links: Sequence[Link], gone: Gone, keys: KnownKeys | None, now_ns: int
+    heads: Sequence[GivenHead], links: Sequence[ChainLink], gone: Gone, keys: KnownKeys | None, now_ns: int
 ) -> End:
     """Compare recordings with all given heads. `gone`: what is known of deleted recordings. `now_ns`: UTC.
 
@@ -141,7 +141,7 @@ def _name(end: End, head: Head, given: GivenHead, now_ns: int) -> None:
     end.age_s = (now_ns - head.utc_ns) * 1e-9
 
 
-def _fault(head: Head, by_number: Mapping[int, Link], gone: Gone, undecided: dict[str, list[int]]) -> str:
+def _fault(head: Head, by_number: Mapping[int, ChainLink], gone: Gone, undecided: dict[str, list[int]]) -> str:
     """Why recordings do not reach as far as a head, with the content that it names; "" where they do.
 
     `undecided` gets what cannot be shown of a recording that is not there.

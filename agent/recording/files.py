@@ -15,7 +15,7 @@ from agent.core.events import RunStart
 from agent.recording.limits import UNPACKED_LIMIT, most_unpacked
 from agent.recording.messages import schema_data, schema_of
 from agent.recording.results_chain import EPOCH, FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
-from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
+from agent.recording.signing import SIGNATURE_METADATA, SignedStatement, Signer
 
 LARGE = UNPACKED_LIMIT // 2  # bytes; the chunk of a larger message is not compressed, since a reader would refuse it
 ACTIVE_SUFFIX = ".active"
@@ -140,9 +140,9 @@ class RecordingFile:
             self._stream.sync()
             self._unsynced = False
 
-    def statement(self) -> Statement:
+    def statement(self) -> SignedStatement:
         """What can be signed of the file: all bytes written so far. Call it after `sync` or `finish`."""
-        return Statement(
+        return SignedStatement(
             self._gateway,
             self._epoch,
             self._number,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from agent.recording.chain import Link
+from agent.recording.chain import ChainLink
 from agent.recording.deleted_list import listed
 from agent.recording.files import misnamed
 from agent.recording.head import Head
@@ -36,7 +36,7 @@ class Gone:
     are no recordings.
     """
 
-    links: Sequence[Link]
+    links: Sequence[ChainLink]
     deleted: Sequence[Deleted] = ()
     statements: tuple[Deleted, ...] = ()
     listed: tuple[Deleted, ...] = ()
@@ -82,7 +82,7 @@ class Gone:
         return (there | named | ends | begins) - {""}
 
 
-def find_gone(directory: Path | None, links: Sequence[Link], heads: Iterable[int], keys: KnownKeys | None) -> Gone:
+def find_gone(directory: Path | None, links: Sequence[ChainLink], heads: Iterable[int], keys: KnownKeys | None) -> Gone:
     """Read what a data directory says of recordings that are not there; nothing without a `directory`. Raises OSError.
 
     `heads`: numbers of the recordings that heads name. With `keys` statements must be signed by one of the gateway's,

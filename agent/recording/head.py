@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from agent.recording.files import file_number
 from agent.recording.reading import open_recording
 from agent.recording.signed_text import SignedText, SignedTextError, count, values_of, written
-from agent.recording.signing import Signer, Statement, prefix_sha256
+from agent.recording.signing import SignedStatement, Signer, prefix_sha256
 
 if TYPE_CHECKING:
     from agent.config.known_keys import KnownKeys
@@ -40,7 +40,7 @@ class Head:
     of this recording, the same in all of its heads. `closed`: whether the recording was finished.
     """
 
-    statement: Statement
+    statement: SignedStatement
     opening: str
     closed: bool
     utc_ns: int
@@ -64,7 +64,7 @@ class Head:
         )
         length, _, sha256 = content.partition(" ")
         epoch, previous = ("" if value == "-" else value for value in (epoch, previous))
-        statement = Statement(gateway, epoch, count(number), previous, results, count(length), sha256)
+        statement = SignedStatement(gateway, epoch, count(number), previous, results, count(length), sha256)
         head = Head(statement, opening, closed == "yes", count(utc_ns))
         if head.text != signed.text:
             raise SignedTextError("its lines are not as this program writes them")
@@ -116,7 +116,7 @@ class HeadKeeper:
         """The recording is finished."""
         self._sign(file.statement(), now_ns, utc_ns, closed=True)
 
-    def _sign(self, statement: Statement, now_ns: int, utc_ns: int, *, closed: bool) -> None:
+    def _sign(self, statement: SignedStatement, now_ns: int, utc_ns: int, *, closed: bool) -> None:
         self._next_ns = now_ns + int(HEAD_S * 1e9)
         signed = self._signer.sign(Head(statement, self._opening, closed, utc_ns).text).json
         self._tell(signed)

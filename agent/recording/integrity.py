@@ -14,9 +14,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Footer, MessageIndex, Metadata
 
 from agent.recording.crc_location import changed_byte
-from agent.recording.records import MAGIC, Fault, Record, RecordError, parse, record_name, refusal, walk
+from agent.recording.records import MAGIC, FileFault, FileRecord, FileRecordError, parse, record_name, refusal, walk
 from agent.recording.results_chain import EPOCH, FILE_METADATA, ResultsChain
-from agent.recording.signing import Statement
+from agent.recording.signing import SignedStatement
 from agent.recording.summary import KINDS, DerivedSummary
 
 FAULTS_KEPT = 20  # faults kept for one file; the others are only counted
@@ -26,7 +26,7 @@ FAULTS_KEPT = 20  # faults kept for one file; the others are only counted
 class Integrity:
     """What the check found. `good_bytes`: offset of the end of the last record with valid boundaries."""
 
-    faults: list[Fault] = field(default_factory=list)
+    faults: list[FileFault] = field(default_factory=list)
     fault_count: int = 0
     finished: bool = False
     good_bytes: int = 0
@@ -35,13 +35,13 @@ class Integrity:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # by name; of one name, the last record
     results: ResultsChain = field(default_factory=ResultsChain)  # at the end of the file
 
-    def statement(self, gateway: str, file_sequence: int) -> Statement:
+    def statement(self, gateway: str, file_sequence: int) -> SignedStatement:
         """What the signature of this file must say; its content is hashed when the signature is checked."""
         origin = self.metadata.get(FILE_METADATA, {})
         epoch, previous_sha256 = origin.get(EPOCH, ""), origin.get("previous_sha256", "")
-        return Statement(gateway, epoch, file_sequence, previous_sha256, self.results.text, 0, "")
+        return SignedStatement(gateway, epoch, file_sequence, previous_sha256, self.results.text, 0, "")
 
-    def add(self, fault: Fault) -> None:
+    def add(self, fault: FileFault) -> None:
         """Count a fault; keep it if it is among the first."""
         self.fault_count += 1
         if len(self.faults) < FAULTS_KEPT:
@@ -58,7 +58,7 @@ def check_integrity(file: BinaryIO, size: int) -> Integrity:
             found.good_bytes = record.end
         found.finished = True
         found.good_bytes = size
-    except RecordError as error:
+    except FileRecordError as error:
         found.add(error.fault)
     found.results = check.results
     for broken in check.broken_sums:
@@ -74,10 +74,10 @@ class _BrokenSum:
     end: int
     recorded: int
     computed: int
-    fault: Fault
+    fault: FileFault
 
 
-def _located(file: BinaryIO, size: int, broken: _BrokenSum) -> Fault:
+def _located(file: BinaryIO, size: int, broken: _BrokenSum) -> FileFault:
     """The fault at the single changed byte that explains a wrong CRC; where there is no such byte, the CRC's fault."""
     at = changed_byte(broken.recorded, broken.computed, broken.end - broken.start)
     if at is None:
@@ -86,7 +86,7 @@ def _located(file: BinaryIO, size: int, broken: _BrokenSum) -> Fault:
     file.seek(0)
     kind = next((record.name for record in walk(file, size) if record.offset <= at < record.end), "magic")
     reason = f"this one byte changed, as the CRC of bytes {broken.start} to {broken.end} shows"
-    return Fault("corrupt", at, kind, reason)
+    return FileFault("corrupt", at, kind, reason)
 
 
 class _Check:
@@ -98,7 +98,7 @@ class _Check:
         self._take = self._header
         self._summary_start = 0
         self._derived = DerivedSummary()
-        self._groups: dict[int, list[tuple[Record, Any]]] = {}
+        self._groups: dict[int, list[tuple[FileRecord, Any]]] = {}
         self.broken_sums: list[_BrokenSum] = []
 
     @property
@@ -106,7 +106,7 @@ class _Check:
         """The chain of the results so far."""
         return self._derived.results
 
-    def take(self, record: Record) -> None:
+    def take(self, record: FileRecord) -> None:
         """Check the next record of the file; add what is wrong to the faults."""
         before = self._crc
         self._crc = zlib.crc32(record.body, zlib.crc32(record.head, before))
@@ -117,16 +117,16 @@ class _Check:
                 self._data_end(record, before)
             else:
                 self._take(record)
-        except RecordError as error:
+        except FileRecordError as error:
             self._found.add(error.fault)
 
-    def _header(self, record: Record) -> None:
+    def _header(self, record: FileRecord) -> None:
         self._take = self._data
         if record.opcode != Opcode.HEADER:
             raise refusal(record, "the first record must be a Header")
         parse(record)
 
-    def _data(self, record: Record) -> None:
+    def _data(self, record: FileRecord) -> None:
         if record.opcode == Opcode.MESSAGE_INDEX:
             return self._derived.add_message_index(record, cast(MessageIndex, parse(record)))
         self._derived.end_of_indexes(record)
@@ -142,7 +142,7 @@ class _Check:
             return self._derived.add_attachment(record, parsed)
         raise refusal(record, "does not belong here, in the data section")
 
-    def _data_end(self, record: Record, crc: int) -> None:
+    def _data_end(self, record: FileRecord, crc: int) -> None:
         self._take = self._summary
         self._crc = 0
         self._summary_start = record.end
@@ -150,15 +150,15 @@ class _Check:
         recorded = cast(DataEnd, parse(record)).data_section_crc
         self._compare_sums(0, record.offset, recorded, crc, record)
 
-    def _compare_sums(self, start: int, end: int, recorded: int, computed: int, record: Record) -> None:
+    def _compare_sums(self, start: int, end: int, recorded: int, computed: int, record: FileRecord) -> None:
         if recorded == 0:
             raise refusal(record, f"the CRC of bytes {start} to {end} is missing in it")
         if recorded != computed:
             reason = f"the CRC in it does not fit bytes {start} to {end}: at least one byte changed"
-            fault = Fault("corrupt", record.offset, record.name, reason)
+            fault = FileFault("corrupt", record.offset, record.name, reason)
             self.broken_sums.append(_BrokenSum(start, end, recorded, computed, fault))
 
-    def _summary(self, record: Record) -> None:
+    def _summary(self, record: FileRecord) -> None:
         if record.opcode not in KINDS:
             raise refusal(record, "does not belong here, in the summary")
         group = self._groups.setdefault(record.opcode, [])
@@ -166,7 +166,7 @@ class _Check:
         if len(group) > 1 and group[-2][0].end != record.offset:
             raise refusal(record, "stands apart from the other summary records of its kind")
 
-    def _footer(self, record: Record, crc: int) -> None:
+    def _footer(self, record: FileRecord, crc: int) -> None:
         if not self._summary_start:
             raise refusal(record, "there is no record DataEnd before it")
         footer = cast(Footer, parse(record))
@@ -185,7 +185,7 @@ class _Check:
         for kind in KINDS:
             self._compare_group(record, kind)
 
-    def _compare_group(self, footer: Record, kind: Opcode) -> None:
+    def _compare_group(self, footer: FileRecord, kind: Opcode) -> None:
         """Compare the summary's records of one kind with the ones derived from the data section."""
         present, expected = self._groups.get(kind, []), self._derived.expected(kind, self._groups)
         for (record, parsed), wanted in zip(present, expected, strict=False):

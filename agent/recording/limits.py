@@ -54,7 +54,7 @@ def longest(opcode: int) -> int:
     return DECLARATION_LIMIT if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else RECORD_LIMIT
 
 
-class Budget:
+class UsedLimits:
     """What of the limits for a whole file is used. One budget belongs to one pass over one file.
 
     After a limit was exceeded, each further record of a chunk is refused too, so that nothing more is decompressed.

@@ -19,15 +19,25 @@ from mcap.records import Channel, Metadata, Schema
 
 from agent.config.files import open_file
 from agent.core.events import Event, Output, RunStart
-from agent.recording.limits import MOST_RESULTS, Budget
+from agent.recording.limits import MOST_RESULTS, UsedLimits
 from agent.recording.messages import MessageError, decode, topic_of
-from agent.recording.records import ChunkMessage, Fault, Record, RecordError, content, parse, refusal, unpack, walk
+from agent.recording.records import (
+    ChunkMessage,
+    FileFault,
+    FileRecord,
+    FileRecordError,
+    content,
+    parse,
+    refusal,
+    unpack,
+    walk,
+)
 
 REPAIR_METADATA = "fieldcal.repair"  # the metadata record of a file that a crash left open and a later start closed
 
 
 @dataclass(slots=True)
-class Step:
+class RecordedStep:
     """An event and the results recorded for it.
 
     `schema`, `data`: name of the event's message and its bytes. `complete`: something was recorded after the results,
@@ -52,16 +62,16 @@ class RecordingReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.fault: Fault | None = None
+        self.fault: FileFault | None = None
         self.good_bytes = 0
         self.repaired = False
         self.undecoded = False
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[RecordedStep]:
         """Yield the events in recorded order. The first is a RunStart; event numbers have no gap. Raises OSError."""
-        step: Step | None = None
+        step: RecordedStep | None = None
         try:
             with open_recording(self.path) as file:
                 for record, number, item, schema, data in self._items(file):
@@ -76,15 +86,15 @@ class RecordingReader:
                     if step is not None:
                         step.complete = True
                         yield step
-                    step = Step(number, item, schema, data)
-        except RecordError as error:
+                    step = RecordedStep(number, item, schema, data)
+        except FileRecordError as error:
             self.fault = error.fault
         if step is not None:
             step.complete = self.fault is None and not self.repaired
             yield step
 
     @staticmethod
-    def _check_order(record: Record, before: Step | None, number: int, event: Event) -> None:
+    def _check_order(record: FileRecord, before: RecordedStep | None, number: int, event: Event) -> None:
         if isinstance(event, RunStart) != (before is None):
             where = "does not begin with a" if before is None else "has a second"
             raise refusal(record, f"the recording {where} RunStart")
@@ -92,9 +102,9 @@ class RecordingReader:
             expected = before.event_sequence + 1
             raise refusal(record, f"event {number} follows event {before.event_sequence}; expected event {expected}")
 
-    def _items(self, file: BinaryIO) -> Iterator[tuple[Record, int, Event | Output, str, bytes]]:
+    def _items(self, file: BinaryIO) -> Iterator[tuple[FileRecord, int, Event | Output, str, bytes]]:
         """Yield (chunk record, event sequence, event or result, schema name, message) for every message."""
-        budget = Budget()
+        budget = UsedLimits()
         for record in walk(file, os.fstat(file.fileno()).st_size):
             if record.opcode == Opcode.CHUNK:
                 for part in content(record, unpack(record, budget), budget):
@@ -110,7 +120,7 @@ class RecordingReader:
                 raise refusal(record, "a message outside a chunk; a recording has messages only in chunks")
             self.good_bytes = record.end
 
-    def _item(self, record: Record, message: ChunkMessage) -> tuple[int, Event | Output, str, bytes]:
+    def _item(self, record: FileRecord, message: ChunkMessage) -> tuple[int, Event | Output, str, bytes]:
         channel = self._channels.get(message.channel_id)
         schema = self._schemas.get(channel.schema_id) if channel else None
         if channel is None or schema is None:

@@ -34,7 +34,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from agent.recording.limits import MOST_MESSAGES_IN_CHUNK, UNPACKED_LIMIT, Budget, LimitExceededError
+from agent.recording.limits import MOST_MESSAGES_IN_CHUNK, UNPACKED_LIMIT, LimitExceededError, UsedLimits
 
 MAGIC = b"\x89MCAP0\r\n"
 _INCONSISTENT = "the lengths in it do not agree with its size"
@@ -60,7 +60,7 @@ _READERS: dict[int, Any] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class FileFault:
     """What is wrong with a file, and where: `offset` in bytes; `record` is the kind of record that begins there.
 
     `torn`: the file only ends early, as after a power cut. `corrupt`: bytes in it differ from what was written.
@@ -75,16 +75,16 @@ class Fault:
         return f"byte {self.offset} ({self.record}): {self.reason}"
 
 
-class RecordError(Exception):
+class FileRecordError(Exception):
     """A record cannot be read. `fault` says where and why."""
 
     def __init__(self, kind: Literal["torn", "corrupt"], offset: int, record: str, reason: str) -> None:
-        self.fault = Fault(kind, offset, record, reason)
+        self.fault = FileFault(kind, offset, record, reason)
         super().__init__(str(self.fault))
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class FileRecord:
     """One record of the file: its offset in bytes, its opcode, and its content without the head of nine bytes."""
 
     offset: int
@@ -130,9 +130,9 @@ class ChunkMessage:
     data: bytes
 
 
-def refusal(record: Record, reason: str) -> RecordError:
+def refusal(record: FileRecord, reason: str) -> FileRecordError:
     """A RecordError of kind `corrupt` for a record."""
-    return RecordError("corrupt", record.offset, record.name, reason)
+    return FileRecordError("corrupt", record.offset, record.name, reason)
 
 
 def record_name(opcode: int) -> str:
@@ -142,47 +142,47 @@ def record_name(opcode: int) -> str:
     return Opcode(opcode).name.title().replace("_", "")
 
 
-def walk(file: BinaryIO, size: int) -> Iterator[Record]:
+def walk(file: BinaryIO, size: int) -> Iterator[FileRecord]:
     """Yield every record of a file of `size` bytes, from the header to the footer. Raises RecordError at a fault."""
     magic = file.read(len(MAGIC))
     if magic != MAGIC:
         reason = "the file does not begin with the bytes of an MCAP file"
         raise _ended(file, size, 0, "magic", reason, early=MAGIC.startswith(magic))
-    offset, opcode, budget = len(MAGIC), 0, Budget()
+    offset, opcode, budget = len(MAGIC), 0, UsedLimits()
     while opcode != Opcode.FOOTER:
         head = file.read(_HEAD.size)
         if len(head) < _HEAD.size or not any(head):  # some file systems replace lost data with zeros
             raise _ended(file, size, offset, "end of file", "the file ends here without a footer")
         opcode, length = _HEAD.unpack(head)
         if opcode not in _KNOWN:
-            raise RecordError("corrupt", offset, record_name(opcode), "MCAP has no such kind of record")
+            raise FileRecordError("corrupt", offset, record_name(opcode), "MCAP has no such kind of record")
         if length > size - offset - _HEAD.size:
             reason = f"its {length} bytes reach beyond the end of the file"
             raise _ended(file, size, offset, record_name(opcode), reason)
         try:
             budget.take_record(opcode, length)
         except LimitExceededError as error:
-            raise RecordError("corrupt", offset, record_name(opcode), str(error)) from None
-        yield Record(offset, opcode, file.read(length))
+            raise FileRecordError("corrupt", offset, record_name(opcode), str(error)) from None
+        yield FileRecord(offset, opcode, file.read(length))
         offset += _HEAD.size + length
     end = file.read(len(MAGIC))
     if end != MAGIC:
         early = len(end) < len(MAGIC) and MAGIC.startswith(end)
         reason = "the file does not end with the bytes of an MCAP file"
-        raise RecordError("torn" if early else "corrupt", offset, "magic", reason)
+        raise FileRecordError("torn" if early else "corrupt", offset, "magic", reason)
     if offset + len(MAGIC) != size:
         reason = f"{size - offset - len(MAGIC)} bytes follow the end of the MCAP data"
-        raise RecordError("corrupt", offset + len(MAGIC), "end of file", reason)
+        raise FileRecordError("corrupt", offset + len(MAGIC), "end of file", reason)
 
 
-def _ended(file: BinaryIO, size: int, offset: int, name: str, reason: str, *, early: bool = True) -> RecordError:
+def _ended(file: BinaryIO, size: int, offset: int, name: str, reason: str, *, early: bool = True) -> FileRecordError:
     """The error where reading cannot go on: torn; or corrupt where the file ends as a complete MCAP file does."""
     file.seek(max(0, size - len(MAGIC)))
     torn = early and (file.read() != MAGIC or size <= len(MAGIC))
-    return RecordError("torn" if torn else "corrupt", offset, name, reason)
+    return FileRecordError("torn" if torn else "corrupt", offset, name, reason)
 
 
-def parse(record: Record) -> McapRecord:
+def parse(record: FileRecord) -> McapRecord:
     """A record as mcap's type (for chunks use `unpack`). Raises RecordError.
 
     A record is refused if writing the parsed record gives other bytes: lengths that disagree, a wrong CRC of an
@@ -213,7 +213,7 @@ class _OfThread(threading.local):
 _of_thread = _OfThread()
 
 
-def unpack(record: Record, budget: Budget, *, crc_needed: bool = True) -> Chunk:
+def unpack(record: FileRecord, budget: UsedLimits, *, crc_needed: bool = True) -> Chunk:
     """The content of a Chunk record, its sizes and CRC checked. Raises RecordError.
 
     `budget`: of this pass over the file. What exceeds it is not decompressed. `crc_needed` False: other programs may
@@ -225,7 +225,7 @@ def unpack(record: Record, budget: Budget, *, crc_needed: bool = True) -> Chunk:
         raise refusal(record, str(error)) from None
 
 
-def _unpack(record: Record, budget: Budget, crc_needed: bool) -> Chunk:
+def _unpack(record: FileRecord, budget: UsedLimits, crc_needed: bool) -> Chunk:
     body = record.body
     if len(body) < _CHUNK.size:
         raise ValueError("too short for a chunk")
@@ -254,7 +254,7 @@ def _unpack(record: Record, budget: Budget, crc_needed: bool) -> Chunk:
     return Chunk(start_time, end_time, compression.decode(), len(packed), data)
 
 
-def content(record: Record, chunk: Chunk, budget: Budget) -> Iterator[ChunkMessage | Schema | Channel]:
+def content(record: FileRecord, chunk: Chunk, budget: UsedLimits) -> Iterator[ChunkMessage | Schema | Channel]:
     """Yield messages, schemas and channels of `chunk`, unpacked from `record`, in order. Raises RecordError."""
     try:
         yield from _content(record, chunk, budget)
@@ -262,7 +262,7 @@ def content(record: Record, chunk: Chunk, budget: Budget) -> Iterator[ChunkMessa
         raise refusal(record, str(error)) from None
 
 
-def _content(record: Record, chunk: Chunk, budget: Budget) -> Iterator[ChunkMessage | Schema | Channel]:
+def _content(record: FileRecord, chunk: Chunk, budget: UsedLimits) -> Iterator[ChunkMessage | Schema | Channel]:
     data, offset, size = chunk.data, 0, len(chunk.data)
     messages = 0
     while offset < size:
@@ -280,7 +280,7 @@ def _content(record: Record, chunk: Chunk, budget: Budget) -> Iterator[ChunkMess
             yield ChunkMessage(offset, channel_id, sequence, log_time, publish_time, payload)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             budget.take_record(opcode, length)
-            inside = Record(record.offset, opcode, data[body_at : body_at + length])
+            inside = FileRecord(record.offset, opcode, data[body_at : body_at + length])
             yield cast(Schema | Channel, parse(inside))
         else:
             reason = f"{record_name(opcode)} of {length} bytes is not allowed at byte {offset} of a decompressed chunk"

@@ -24,12 +24,12 @@ from agent.core.events import RunStart
 from agent.recording.files import ACTIVE_SUFFIX, recordings, sync_directory
 from agent.recording.head import begins_as_signed, head_beside
 from agent.recording.integrity import check_integrity
-from agent.recording.limits import Budget
+from agent.recording.limits import UsedLimits
 from agent.recording.reading import REPAIR_METADATA, RecordingReader, first_event
-from agent.recording.records import MAGIC, Record, RecordError, parse, unpack, walk
+from agent.recording.records import MAGIC, FileRecord, FileRecordError, parse, unpack, walk
 from agent.recording.results_chain import EPOCH, FILE_METADATA
 from agent.recording.scan import metadata_of
-from agent.recording.signing import SIGNATURE_METADATA, Signer, Statement
+from agent.recording.signing import SIGNATURE_METADATA, SignedStatement, Signer
 from agent.recording.summary import KINDS, DerivedSummary
 
 TAIL_ATTACHMENT = "torn"
@@ -53,7 +53,7 @@ def close_torn(directory: Path, signer: Signer | None = None, *, own: bool = Fal
         if path.name.endswith(ACTIVE_SUFFIX):
             try:
                 _log.warning("%s", close_file(path, signer, own=own))
-            except (OSError, RecordError) as error:
+            except (OSError, FileRecordError) as error:
                 _log.warning("%s was left unfinished and cannot be closed: %s", path, error)
 
 
@@ -121,7 +121,7 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
         sound.crc = zlib.crc32(data, sound.crc)
         sound.sha256.update(data)
 
-    broken: RecordError | None = None
+    broken: FileRecordError | None = None
     goes_on = False  # an intact chunk follows the broken record: a crash does not cause that
     try:
         for record in walk(file, size):
@@ -132,28 +132,28 @@ def _sound_part(file: BinaryIO, size: int) -> _Sound:
                 break
             try:
                 _take(sound.derived, record)
-            except RecordError as error:
+            except FileRecordError as error:
                 broken = error
                 continue
             keep(record.head + record.body if sound.length else MAGIC + record.head + record.body)
             sound.chunks = len(sound.derived.chunks)
-    except RecordError as error:
+    except FileRecordError as error:
         broken = broken or error
     if broken is not None and (goes_on or not _is_torn(file, sound, broken)):
         raise broken
     return sound
 
 
-def _is_torn(file: BinaryIO, sound: _Sound, broken: RecordError) -> bool:
+def _is_torn(file: BinaryIO, sound: _Sound, broken: FileRecordError) -> bool:
     """Whether a file that is broken there may be one that a crash has left."""
     corrupt = broken.fault.kind == "corrupt" and not sound.chunks
     return not corrupt and _ends_in_zeros(file, sound.length + TAIL_MAX)
 
 
-def _is_sound(chunk: Record) -> bool:
+def _is_sound(chunk: FileRecord) -> bool:
     try:
-        unpack(chunk, Budget())
-    except RecordError:
+        unpack(chunk, UsedLimits())
+    except FileRecordError:
         return False
     return True
 
@@ -167,7 +167,7 @@ def _ends_in_zeros(file: BinaryIO, offset: int) -> bool:
     return True
 
 
-def _take(derived: DerivedSummary, record: Record) -> None:
+def _take(derived: DerivedSummary, record: FileRecord) -> None:
     if record.opcode == Opcode.CHUNK:
         derived.end_of_indexes(record)
         derived.add_chunk(record)
@@ -196,7 +196,7 @@ def _signing(path: Path, signer: Signer) -> Sign | None:
 
     def sign(sound: _Sound) -> dict[str, str]:
         results, sha256 = sound.derived.results.text, sound.sha256.hexdigest()
-        return signer.metadata(Statement(gateway, epoch, number, previous_sha256, results, sound.length, sha256))
+        return signer.metadata(SignedStatement(gateway, epoch, number, previous_sha256, results, sound.length, sha256))
 
     return sign
 
@@ -228,7 +228,7 @@ def _end(sound: _Sound, tail: bytes, size: int, sign: Sign | None, unsigned: str
         builder = RecordBuilder()
         record.write(builder)
         data = builder.end()
-        _take(sound.derived, Record(sound.length, data[0], data[9:]))
+        _take(sound.derived, FileRecord(sound.length, data[0], data[9:]))
         sound.length += len(data)
         sound.crc = zlib.crc32(data, sound.crc)
         sound.sha256.update(data)

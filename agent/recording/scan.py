@@ -15,10 +15,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
 from agent.core.events import Result
-from agent.recording.limits import Budget, longest
+from agent.recording.limits import UsedLimits, longest
 from agent.recording.messages import MessageError, decode, is_result_topic
 from agent.recording.reading import open_recording
-from agent.recording.records import MAGIC, ChunkMessage, Record, RecordError, content, parse, unpack
+from agent.recording.records import MAGIC, ChunkMessage, FileRecord, FileRecordError, content, parse, unpack
 
 _HEAD = struct.Struct("<BQ")
 _CHANNEL_ID = struct.Struct("<H")
@@ -57,7 +57,7 @@ class _Scan:
     def __init__(self, file: BinaryIO, found: ScannedFile) -> None:
         self._file = file
         self._found = found
-        self._budget = Budget()
+        self._budget = UsedLimits()
         self._schemas: dict[int, str] = {}
         self._results: dict[int, str] = {}  # schema name by channel, of channels with results
         self._others: set[int] = set()
@@ -89,14 +89,14 @@ class _Scan:
             yield offset, opcode, length
             offset += _HEAD.size + length
 
-    def _record(self, offset: int, opcode: int, length: int) -> Record:
+    def _record(self, offset: int, opcode: int, length: int) -> FileRecord:
         self._file.seek(offset + _HEAD.size)
-        return Record(offset, opcode, self._file.read(length))
+        return FileRecord(offset, opcode, self._file.read(length))
 
     def _take_metadata(self, offset: int, length: int) -> None:
         try:
             metadata = parse(self._record(offset, Opcode.METADATA, length))
-        except RecordError as error:
+        except FileRecordError as error:
             self._found.faults.append(str(error))
             return
         if isinstance(metadata, Metadata):
@@ -111,7 +111,7 @@ class _Scan:
         try:
             for part in content(record, unpack(record, self._budget), self._budget):
                 self._take_part(part)
-        except (RecordError, MessageError) as error:
+        except (FileRecordError, MessageError) as error:
             self._found.faults.append(str(error))
 
     def _take_part(self, part: ChunkMessage | Schema | Channel) -> None:

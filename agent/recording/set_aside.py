@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Statements:
+class DeletionStatements:
     """The statements of a directory that count. `of_version_1`: they give the number only, so any recording can be
     meant. `faults`: why the others do not count.
     """
@@ -84,7 +84,9 @@ def finish(directory: Path) -> None:
         path.rename(directory / recording_name(number))
 
 
-def statements(directory: Path, gateway: str, keys: KnownKeys | None, repeated: Sequence[Deleted]) -> Statements:
+def statements(
+    directory: Path, gateway: str, keys: KnownKeys | None, repeated: Sequence[Deleted]
+) -> DeletionStatements:
     """The statements in a directory about recordings of a gateway. Raises OSError.
 
     `repeated`: what recordings say was deleted; statements about it are left out. With `keys` a statement must be
@@ -111,7 +113,7 @@ def statements(directory: Path, gateway: str, keys: KnownKeys | None, repeated: 
             faults.append(f"{path} does not show that retention deleted this recording: {fault}")
         else:
             group.append(deleted)
-    return Statements(tuple(found), tuple(of_version_1), tuple(faults))
+    return DeletionStatements(tuple(found), tuple(of_version_1), tuple(faults))
 
 
 def highest_number(directory: Path) -> int:

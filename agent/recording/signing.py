@@ -41,7 +41,7 @@ _OTHER_BYTES = "its signature is of other bytes than the file holds: the file wa
 
 
 @dataclass(frozen=True, slots=True)
-class Statement:
+class SignedStatement:
     """What the signature of a recording says.
 
     `epoch`: of the store, "" where there was none. `previous_sha256`: of the whole file before it, "" where there is
@@ -100,7 +100,7 @@ class Signer:
         """The signature of bytes that begin with the line of their purpose."""
         return self._key.sign(data)
 
-    def metadata(self, statement: Statement) -> dict[str, str]:
+    def metadata(self, statement: SignedStatement) -> dict[str, str]:
         """The metadata record with the signature of a recording."""
         signed = self.sign(statement.text)
         return {
@@ -138,7 +138,9 @@ def signed_results(metadata: dict[str, str] | None) -> str | None:
         return None
 
 
-def verify_file(file: BinaryIO, size: int, metadata: dict[str, str] | None, keys: KnownKeys, found: Statement) -> str:
+def verify_file(
+    file: BinaryIO, size: int, metadata: dict[str, str] | None, keys: KnownKeys, found: SignedStatement
+) -> str:
     """Why an MCAP file is not signed up to its summary with one of its gateway's keys; "" where it is. Raises OSError.
 
     `size`: of the file in bytes. `metadata`: its signature record, None where it has none. `found`: what its signature
@@ -189,7 +191,7 @@ def _fault_1(metadata: dict[str, str], sha256: bytes, keys: KnownKeys, gateway: 
     return signature_fault(metadata.get("signature", ""), _CONTEXT_1 + sha256, key)
 
 
-def _fault_2(metadata: dict[str, str], found: Statement, said: list[str], keys: KnownKeys) -> str:
+def _fault_2(metadata: dict[str, str], found: SignedStatement, said: list[str], keys: KnownKeys) -> str:
     signed = signed_text(metadata)
     if fault := signed.key_fault(keys, found.gateway):
         return fault

@@ -18,8 +18,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from agent.recording.limits import Budget
-from agent.recording.records import ChunkMessage, Record, content, refusal, unpack
+from agent.recording.limits import UsedLimits
+from agent.recording.records import ChunkMessage, FileRecord, content, refusal, unpack
 from agent.recording.results_chain import FILE_METADATA, PREVIOUS_RESULTS, ResultsChain
 
 KINDS = (
@@ -40,7 +40,7 @@ class DerivedSummary:
     """
 
     def __init__(self) -> None:
-        self._budget = Budget()
+        self._budget = UsedLimits()
         self.messages = 0
         self.results = ResultsChain()  # of the results so far
         self.chunks: list[ChunkIndex] = []
@@ -53,7 +53,7 @@ class DerivedSummary:
         # Message indexes that must follow the last chunk, by channel; None where this chunk is damaged.
         self._awaited: dict[int, list[tuple[int, int]]] | None = {}
 
-    def add_chunk(self, record: Record) -> None:
+    def add_chunk(self, record: FileRecord) -> None:
         """Take a Chunk record: decompress it and read the records in it."""
         self._awaited = None  # until the chunk is known to be intact
         chunk = unpack(record, self._budget)
@@ -93,14 +93,14 @@ class DerivedSummary:
         self.chunks.append(index)
         self._awaited = awaited
 
-    def _declare(self, record: Record, part: Schema | Channel) -> None:
+    def _declare(self, record: FileRecord, part: Schema | Channel) -> None:
         known: dict[int, Any] = self._schemas if isinstance(part, Schema) else self._channels
         if known.setdefault(part.id, part) != part:
             raise refusal(record, f"{type(part).__name__} {part.id} is declared twice, with different content")
         if isinstance(part, Channel) and part.schema_id not in self._schemas:
             raise refusal(record, f"channel {part.topic} has schema {part.schema_id}, which no record before declares")
 
-    def add_message_index(self, record: Record, index: MessageIndex) -> None:
+    def add_message_index(self, record: FileRecord, index: MessageIndex) -> None:
         """Take one of the message indexes after a chunk."""
         if self._awaited is None:
             return
@@ -109,7 +109,7 @@ class DerivedSummary:
         self.chunks[-1].message_index_offsets[index.channel_id] = record.offset
         self.chunks[-1].message_index_length += record.end - record.offset
 
-    def end_of_indexes(self, record: Record) -> None:
+    def end_of_indexes(self, record: FileRecord) -> None:
         """Take a record that is not a message index: all message indexes of the last chunk must be before it."""
         missing, self._awaited = sorted(self._awaited or ()), {}
         if missing:
@@ -119,13 +119,13 @@ class DerivedSummary:
         """The message indexes of the last chunk that are still missing after it."""
         return [MessageIndex(channel_id, records) for channel_id, records in (self._awaited or {}).items()]
 
-    def add_metadata(self, record: Record, metadata: Metadata) -> None:
+    def add_metadata(self, record: FileRecord, metadata: Metadata) -> None:
         """Take a Metadata record."""
         if metadata.name == FILE_METADATA:
             self.results = ResultsChain.of_text(metadata.metadata.get(PREVIOUS_RESULTS, ""))
         self._metadata.append(MetadataIndex(record.offset, record.end - record.offset, metadata.name))
 
-    def add_attachment(self, record: Record, attachment: Attachment) -> None:
+    def add_attachment(self, record: FileRecord, attachment: Attachment) -> None:
         """Take an Attachment record."""
         index = AttachmentIndex(
             offset=record.offset,
@@ -138,7 +138,7 @@ class DerivedSummary:
         )
         self._attachments.append(index)
 
-    def expected(self, kind: Opcode, groups: dict[int, list[tuple[Record, Any]]]) -> list[Any]:
+    def expected(self, kind: Opcode, groups: dict[int, list[tuple[FileRecord, Any]]]) -> list[Any]:
         """The records of one kind that the summary must hold. `groups`: the records that it does hold, by opcode."""
         if kind == Opcode.SUMMARY_OFFSET:
             return [_offset(offset, groups.get(offset.group_opcode)) for _, offset in groups.get(kind, [])]
@@ -166,7 +166,7 @@ class DerivedSummary:
         )
 
 
-def _offset(present: SummaryOffset, group: list[tuple[Record, Any]] | None) -> SummaryOffset:
+def _offset(present: SummaryOffset, group: list[tuple[FileRecord, Any]] | None) -> SummaryOffset:
     """The correct SummaryOffset; for an empty group it names the place where the group would be."""
     if not group:
         return SummaryOffset(present.group_opcode, present.group_start, 0)

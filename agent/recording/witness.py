@@ -48,7 +48,7 @@ class WitnessError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class KeptHead:
     """One kept head, and when it arrived (UTC of the witness)."""
 
     signed: SignedText
@@ -57,7 +57,7 @@ class Kept:
 
 
 @dataclass(slots=True)
-class Known:
+class KnownHeads:
     """What heads of a gateway say, so that a contradiction is seen.
 
     `newest`: the head that reaches furthest, by epoch: a data directory that was lost begins again at recording 1.
@@ -99,7 +99,7 @@ class Known:
 
 
 @dataclass(slots=True)
-class Allowance:
+class ByteAllowance:
     """Bytes that a gateway may still cost, by the witness's clock. A clock that is set back takes nothing away."""
 
     left_bytes: float = AT_ONCE_BYTES
@@ -117,28 +117,28 @@ class HeadFile:
 
     def __init__(self, path: Path, key: Ed25519PublicKey, *, repair: bool = False) -> None:
         self._path = path
-        self._known = Known()  # of the kept heads
+        self._known = KnownHeads()  # of the kept heads
         self.lines = 0
         self.contradictions: list[str] = []
         self.public_key = ""  # of the first head: the gateway's
-        self.newest_of_each: dict[int, tuple[int, Kept]] = {}  # (line, head) by number of the recording
+        self.newest_of_each: dict[int, tuple[int, KeptHead]] = {}  # (line, head) by number of the recording
         self.heard_ns = 0  # from the first kept head to the last one
         self._first_ns: int | None = None
         self._previous = "-"
         self._kept_ns: dict[str, int] = {}  # when the newest head of each epoch arrived
-        self._unkept: Kept | None = None  # it reaches further than the kept ones
-        self._allowance = Allowance()
+        self._unkept: KeptHead | None = None  # it reaches further than the kept ones
+        self._allowance = ByteAllowance()
         if path.exists():
             for line, kept in self._read(key, repair=repair):
                 self._take(line, kept)
 
-    def worth(self, offered: Kept) -> list[Kept]:
+    def worth(self, offered: KeptHead) -> list[KeptHead]:
         """The heads to keep now that this one, whose signature was checked, has arrived: most often none or itself.
 
         Two, where it contradicts a head that was not kept: only both together prove two histories.
         """
         head, unkept, now_ns = offered.head, self._unkept, offered.received_utc_ns
-        lately = Known()
+        lately = KnownHeads()
         if unkept is not None:
             lately.add(unkept.head)
         contradiction = self._known.contradiction(head)
@@ -165,7 +165,7 @@ class HeadFile:
             return True
         return not 0 <= now_ns - self._kept_ns[head.statement.epoch] < KEEP_NS
 
-    def append(self, kept: Kept, signer: Signer) -> None:
+    def append(self, kept: KeptHead, signer: Signer) -> None:
         """Keep a head. Raises OSError; the file is then as it was before, unless the disk itself fails."""
         values = {
             "number": str(self.lines + 1),
@@ -191,7 +191,7 @@ class HeadFile:
         with suppress(OSError):
             self._path.parent.rmdir()
 
-    def _take(self, line: bytes, kept: Kept) -> None:
+    def _take(self, line: bytes, kept: KeptHead) -> None:
         epoch, head = kept.head.statement.epoch, kept.head
         self.lines += 1
         self._previous = hashlib.sha256(line).hexdigest()
@@ -208,7 +208,7 @@ class HeadFile:
         self._allowance.at(kept.received_utc_ns)
         self._allowance.left_bytes -= len(line)
 
-    def _read(self, key: Ed25519PublicKey, *, repair: bool) -> Iterator[tuple[bytes, Kept]]:
+    def _read(self, key: Ed25519PublicKey, *, repair: bool) -> Iterator[tuple[bytes, KeptHead]]:
         good = 0
         with open(self._path, "rb") as file:
             while line := file.readline(_LARGEST_LINE + 1):
@@ -220,7 +220,7 @@ class HeadFile:
         if repair:
             os.truncate(self._path, good)
 
-    def _kept(self, line: bytes, number: int, key: Ed25519PublicKey) -> Kept:
+    def _kept(self, line: bytes, number: int, key: Ed25519PublicKey) -> KeptHead:
         where = f"{self._path}: line {number}"
         try:
             entry = SignedText.read(line.removesuffix(b"\n"), _LARGEST_LINE)
@@ -230,7 +230,7 @@ class HeadFile:
             if (said, previous) != (str(number), self._previous):
                 raise WitnessError(f"{where}: it does not follow the line before it: lines were removed or reordered")
             signed = SignedText.read(head.encode())
-            return Kept(signed, Head.of(signed), count(received))
+            return KeptHead(signed, Head.of(signed), count(received))
         except SignedTextError as error:
             raise WitnessError(f"{where}: {error}") from None
 
@@ -277,7 +277,7 @@ class Witness:
                 return False, f"{gateway}: refused, {fault}"
             known = self._new(gateway)
         try:
-            return self._keep(gateway, known, Kept(signed, head, self._clock()))
+            return self._keep(gateway, known, KeptHead(signed, head, self._clock()))
         finally:
             if not known.lines:  # the disk is full
                 self._remove(gateway)
@@ -305,7 +305,7 @@ class Witness:
         self._remove(least)
         return ""
 
-    def _keep(self, gateway: str, file: HeadFile, offered: Kept) -> tuple[bool, str]:
+    def _keep(self, gateway: str, file: HeadFile, offered: KeptHead) -> tuple[bool, str]:
         before = len(file.contradictions)
         worth = file.worth(offered)
         for kept in worth:

@@ -15,7 +15,7 @@ from agent.report.units import position_name
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class DrawnFigure:
     """A figure that was saved as `name`.svg, .png and .pdf; `svg` is for the page."""
 
     name: str
@@ -23,12 +23,12 @@ class Drawn:
     svg: str
 
 
-def draw(material: Material, shown: Residuals | None, directory: Path) -> list[Drawn]:
+def draw(material: Material, shown: Residuals | None, directory: Path) -> list[DrawnFigure]:
     """Save all figures for which the material has data. Raises OSError."""
     directory.mkdir(parents=True, exist_ok=True)
     with style.drawing():
         return [
-            Drawn(name, caption, style.save(figure, directory, name))
+            DrawnFigure(name, caption, style.save(figure, directory, name))
             for name, caption, figure in _figures(material, shown)
             if figure is not None
         ]

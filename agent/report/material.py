@@ -18,9 +18,9 @@ from agent.core.outcome import with_budget
 from agent.core.past import PastError, budget_in_force
 from agent.delivery.calibrations import calibrations, made
 from agent.delivery.evidence import evidence
-from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.recording.files import recordings
-from agent.report.recorded import Recorded, RecordingError, read_recordings, sensors_of
+from agent.report.recorded import RecordedSensor, RecordingError, read_recordings, sensors_of
 from agent.report.result import (
     CalibrationResult,
     ResultError,
@@ -141,7 +141,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     windows = [_verdict(w.result) for w in seen if isinstance(w.result, WindowReport)]
     wanted = list(dict.fromkeys(w.recording for w in seen if w.fields.get("used")))
     paths, lost = _present(directory, wanted[-MOST_RECORDINGS:])
-    recorded = read_recordings(paths, chosen) if paths else Recorded(chosen)
+    recorded = read_recordings(paths, chosen) if paths else RecordedSensor(chosen)
     recorded.status = status.result if status and isinstance(status.result, StatusChange) else recorded.status
     updates = [record.result for record in kept if isinstance(record.result, CalibrationUpdate)]
     newest = [in_force.result] if in_force and isinstance(in_force.result, CalibrationUpdate) else []
@@ -163,7 +163,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     return material
 
 
-def _run_of(history: History, sensor: str, in_force: Record | None) -> str:
+def _run_of(history: History, sensor: str, in_force: StoredResult | None) -> str:
     """The run in which the calibration in force was made. If none is in force, the run of the newest window."""
     if in_force is not None:
         return made(in_force)[0]
@@ -177,7 +177,7 @@ def _present(directory: Path, names: Sequence[str]) -> tuple[list[Path], list[st
     return [there[name] for name in names if name in there], [name for name in names if name not in there]
 
 
-def _of(recorded: Recorded, windows: list[WindowVerdict], calibrations: list[CalibrationUpdate]) -> Material:
+def _of(recorded: RecordedSensor, windows: list[WindowVerdict], calibrations: list[CalibrationUpdate]) -> Material:
     """The material for the newest calibration of a sensor. If there is none, its reasons say why."""
     versions = recorded.starts[-1].versions if recorded.starts else {}
     if calibrations:
@@ -198,7 +198,7 @@ def _of(recorded: Recorded, windows: list[WindowVerdict], calibrations: list[Cal
     return Material(recorded.sensor, [result], traces=recorded.traces, facts=facts, notices=notices)
 
 
-def _facts(recorded: Recorded) -> dict[str, Any]:
+def _facts(recorded: RecordedSensor) -> dict[str, Any]:
     facts: dict[str, Any] = {}
     if recorded.starts:
         start = recorded.starts[-1]

@@ -7,7 +7,7 @@ from importlib.resources import files
 
 from agent import __version__
 from agent.report import tables
-from agent.report.figures import Drawn
+from agent.report.figures import DrawnFigure
 from agent.report.material import Material
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
@@ -16,7 +16,7 @@ from agent.terminal.text import page_text
 from calib.output_unit import ACCELERATION
 
 
-def page(material: Material, figures: Sequence[Drawn], seen: Sequence[Residuals]) -> str:
+def page(material: Material, figures: Sequence[DrawnFigure], seen: Sequence[Residuals]) -> str:
     """The whole page. `seen`: residuals of the traced windows for the first result."""
     style = files("agent.report").joinpath("page.css").read_text(encoding="utf-8")
     title = f"Calibration of {material.sensor}" if material.sensor else "Calibration"
@@ -66,7 +66,7 @@ def _box(heading: str, sentences: Sequence[str]) -> str:
     return f'<div class="box">{heading}<ul>{listed}</ul></div>'
 
 
-def _figures(figures: Sequence[Drawn]) -> Iterator[str]:
+def _figures(figures: Sequence[DrawnFigure]) -> Iterator[str]:
     if figures:
         yield '<h2>Figures</h2>\n<div class="figures">'
         for drawn in figures:

@@ -19,7 +19,7 @@ from agent.core.snapshot import unpack
 from agent.core.stream import DeviceStream
 from agent.core.windows import margin_of
 from agent.recording.reading import RecordingReader
-from agent.recording.records import Fault
+from agent.recording.records import FileFault
 from agent.report.trace import Trace
 from calib.excitation.front_end import Settings, aligned, most_margin_s
 from calib.model import Pose
@@ -30,7 +30,7 @@ MOST_TRACES = 24  # windows kept point by point: the newest window of each of so
 
 
 @dataclass(slots=True)
-class Recorded:
+class RecordedSensor:
     """The content of recordings for one sensor; `traces` by position, the newest last.
 
     `reference_quantity`: what its reference gives; None where there is no reference, or where nothing tells it.
@@ -44,7 +44,7 @@ class Recorded:
     traces: dict[str, Trace] = field(default_factory=dict)
     starts: list[RunStart] = field(default_factory=list)
     devices: dict[str, str] = field(default_factory=dict)  # DeviceInfo as JSON, by name
-    faults: list[tuple[Path, Fault]] = field(default_factory=list)
+    faults: list[tuple[Path, FileFault]] = field(default_factory=list)
 
 
 class RecordingError(Exception):
@@ -56,21 +56,21 @@ def sensors_of(path: Path) -> list[str]:
     return [channel.sensor for channel in _config(path).channels]
 
 
-def read_recordings(paths: list[Path], sensor: str) -> Recorded:
+def read_recordings(paths: list[Path], sensor: str) -> RecordedSensor:
     """Read files in the given order, each by itself. Raises RecordingError if one is damaged or cannot be read."""
-    out = Recorded(sensor)
+    out = RecordedSensor(sensor)
     for path in paths:
         channel = next((c for c in _config(path).channels if c.sensor == sensor), None)
         if channel is None:
             raise RecordingError(f"{path}: the recording has no channel with the sensor {sensor!r}")
         out.reference_quantity = channel.instrument.quantity if channel.reference is not None else None
         reader = RecordingReader(path)
-        windows: _Windows | None = None
+        windows: _WindowStreams | None = None
         for step in reader.steps():
             with _followed(path):
                 if isinstance(step.event, RunStart):
                     out.starts.append(step.event)
-                    windows = _Windows(channel, step.event)
+                    windows = _WindowStreams(channel, step.event)
                 assert windows is not None  # a recording with any step begins with RunStart
                 windows.update(step.event)
                 _take(out, step.event, step.results, windows)
@@ -93,7 +93,7 @@ def _followed(path: Path) -> Iterator[None]:
         ) from None
 
 
-def _take(out: Recorded, event: Event, results: list[Output], windows: _Windows) -> None:
+def _take(out: RecordedSensor, event: Event, results: list[Output], windows: _WindowStreams) -> None:
     if isinstance(event, DeviceChange) and event.info_json:
         out.devices[event.device] = event.info_json
     for result in results:
@@ -131,7 +131,7 @@ def _config(path: Path) -> Config:
         raise RecordingError(f"{path}: its configuration cannot be read: {error}") from None
 
 
-class _Windows:
+class _WindowStreams:
     """The streams of a channel as they were when the pipeline judged a window."""
 
     def __init__(self, channel: Channel, start: RunStart) -> None:

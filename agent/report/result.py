@@ -50,7 +50,7 @@ class WindowVerdict(msgspec.Struct, frozen=True):
     kind: str = ""
 
 
-class Band(msgspec.Struct, frozen=True):
+class ThirdOctave(msgspec.Struct, frozen=True):
     """The complex sensitivity in one third octave; None where it is not known."""
 
     low_hz: float
@@ -65,10 +65,10 @@ class Frequencies(msgspec.Struct, frozen=True):
 
     reference_frequency_hz: float | None = None
     valid_band_hz: tuple[float, float] | None = None
-    response: tuple[Band, ...] | None = None
+    response: tuple[ThirdOctave, ...] | None = None
 
     @property
-    def bands(self) -> tuple[Band, ...]:
+    def bands(self) -> tuple[ThirdOctave, ...]:
         """Those that are known."""
         known = self.response or ()
         return tuple(b for b in known if b.sensitivity_re and b.sensitivity_im and b.standard_uncertainty)
@@ -76,7 +76,7 @@ class Frequencies(msgspec.Struct, frozen=True):
     def times(self, factor: float) -> Frequencies:
         """The same with the sensitivity of each band multiplied."""
         bands = [
-            Band(b.low_hz, b.high_hz, *((factor * np.array(m, dtype=float)).tolist()
+            ThirdOctave(b.low_hz, b.high_hz, *((factor * np.array(m, dtype=float)).tolist()
                  for m in (b.sensitivity_re, b.sensitivity_im, b.standard_uncertainty)))
             for b in self.bands
         ]  # fmt: skip

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from agent import __version__
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.report.figures import draw
 from agent.report.material import Material
 from agent.report.page import page
@@ -38,7 +38,7 @@ def as_object(material: Material, seen: list[Residuals], figures: list[str]) -> 
         "version": __version__,
         "sensor": material.sensor,
         "results": [plain(r.fields) | dict.fromkeys(("unit", "output_unit"), r.unit or None) for r in material.results],
-        "history": [Record.of(update, recorded=True, recording="").fields for update in material.history],
+        "history": [StoredResult.of(update, recorded=True, recording="").fields for update in material.history],
         "residuals": [
             {"position": r.position, "start_s": plain(r.time_s[0]), "stop_s": plain(r.time_s[-1]), "rms": plain(r.rms)}
             for r in seen

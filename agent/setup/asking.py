@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Stated(Generic[T]):
+class SourcedValue(Generic[T]):
     """A value and where it comes from."""
 
     value: T
@@ -21,7 +21,7 @@ class Stated(Generic[T]):
 
 
 @dataclass(slots=True)
-class Asking:
+class Interview:
     """Decides each value, in this order: option, question, default. What is missing is collected in `faults`.
 
     `interactive`: whether questions may be asked.
@@ -38,20 +38,20 @@ class Asking:
         default: Any = None,
         *,
         kind: Any = None,
-    ) -> Stated[Any]:
+    ) -> SourcedValue[Any]:
         """One value. `option` states it on the command line; `kind` is what click's prompt takes as type.
 
         Without a terminal a value that has no default is a fault, and the value is None.
         """
         if given is not None and given != ():
-            return Stated(given, f"option {option}")
+            return SourcedValue(given, f"option {option}")
         if self.interactive:
             answer = click.prompt(question, default=default, type=kind)
-            return Stated(answer, "default" if answer == default else "answered")
+            return SourcedValue(answer, "default" if answer == default else "answered")
         if default is None:
             self.faults.append(f"{option} is missing: {question}")
-            return Stated(None, "missing")
-        return Stated(default, "default")
+            return SourcedValue(None, "missing")
+        return SourcedValue(default, "default")
 
 
 def driver_options(pairs: tuple[str, ...], option: str) -> dict[str, Any]:

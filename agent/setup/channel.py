@@ -12,43 +12,45 @@ from agent.config.channel import Channel
 from agent.config.devices import Gateway
 from agent.config.knowledge import Certificate, Prior, Uncertainty
 from agent.config.sinks import Recording, Zenoh
-from agent.setup.asking import Stated
-from agent.setup.toml import Setting, Table
+from agent.setup.asking import SourcedValue
+from agent.setup.toml import TomlSetting, TomlTable
 from calib.geometry import u_of_gravity_mps2
 
 Mount = Literal["clamp", "beside", "rests"]
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 # MEMS accelerometers: data sheets state an offset of at most 75 mg; as a uniform distribution, u is 0.42 m/s2. With the
 # default of 20 m/s2 (nothing is known) gravity could not tell two positions apart.
-U_OFFSET = Stated(0.5, "init; data sheets of MEMS accelerometers state 75 mg at most, and gravity tells the positions")
+U_OFFSET = SourcedValue(
+    0.5, "init; data sheets of MEMS accelerometers state 75 mg at most, and gravity tells the positions"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Answers:
     """What a configuration states besides its devices. Each has its source."""
 
-    site: Stated[str]
-    gateway: Stated[str]
-    mount: Stated[Mount]
-    theta_deg: Stated[float | None]
-    alpha_deg: Stated[tuple[float, ...] | None]
-    rotation: Stated[tuple[float, ...]]
-    gravity_mps2: Stated[float]
-    sensitivity: Stated[float | None]
-    u_main_pct: Stated[float]
-    quantity: Stated[str]
-    reference_sensitivity: Stated[float]
-    u_reference_pct: Stated[float]
-    reference_serial: Stated[str]
-    calibrated: Stated[str]
-    connect: Stated[tuple[str, ...]]
-    signing_key: Stated[str | None]
+    site: SourcedValue[str]
+    gateway: SourcedValue[str]
+    mount: SourcedValue[Mount]
+    theta_deg: SourcedValue[float | None]
+    alpha_deg: SourcedValue[tuple[float, ...] | None]
+    rotation: SourcedValue[tuple[float, ...]]
+    gravity_mps2: SourcedValue[float]
+    sensitivity: SourcedValue[float | None]
+    u_main_pct: SourcedValue[float]
+    quantity: SourcedValue[str]
+    reference_sensitivity: SourcedValue[float]
+    u_reference_pct: SourcedValue[float]
+    reference_serial: SourcedValue[str]
+    calibrated: SourcedValue[str]
+    connect: SourcedValue[tuple[str, ...]]
+    signing_key: SourcedValue[str | None]
 
 
-def gateway_table(answers: Answers) -> Table:
+def gateway_table(answers: Answers) -> TomlTable:
     """The names of site and gateway."""
     says = "the Zenoh keys of all results begin with fieldcal/v1/SITE/NAME"
-    return Table(
+    return TomlTable(
         "[gateway]",
         [
             _setting(Gateway, "site", answers.site, f"name of the site; {says}"),
@@ -57,7 +59,7 @@ def gateway_table(answers: Answers) -> Table:
     )
 
 
-def channel_tables(answers: Answers) -> Iterator[Table]:
+def channel_tables(answers: Answers) -> Iterator[TomlTable]:
     """The channel: geometry, and what is known beforehand."""
     rests = answers.mount.value == "rests"
     settings = [_given("sensor", "sensor", "device that is calibrated")]
@@ -67,17 +69,17 @@ def channel_tables(answers: Answers) -> Iterator[Table]:
     settings.append(_setting(Channel, "gravity_mps2", answers.gravity_mps2, says, "m/s2"))
     says = "a longer interval is cut into windows of this length"
     settings.append(_setting(Channel, "window_s", _default(Channel, "window_s"), says, "s"))
-    yield Table("[[channels]]", [*settings, *_geometry(answers)])
+    yield TomlTable("[[channels]]", [*settings, *_geometry(answers)])
     yield _prior(answers)
     if not rests:
         yield _certificate(answers)
     yield _uncertainty(answers)
 
 
-def sink_tables(answers: Answers) -> Iterator[Table]:
+def sink_tables(answers: Answers) -> Iterator[TomlTable]:
     """Recording and network."""
     says = "recordings older than this are deleted; without it they are kept until the disk is nearly full"
-    yield Table(
+    yield TomlTable(
         "[recording]",
         [
             _setting(Recording, "rotate_s", _default(Recording, "rotate_s"), "a new file after this time", "s"),
@@ -86,10 +88,10 @@ def sink_tables(answers: Answers) -> Iterator[Table]:
         ],
     )
     says = "Zenoh routers to which results go; without a router they wait in the store"
-    yield Table("[zenoh]", [_setting(Zenoh, "connect", answers.connect, says)])
+    yield TomlTable("[zenoh]", [_setting(Zenoh, "connect", answers.connect, says)])
 
 
-def _geometry(answers: Answers) -> Iterator[Setting]:
+def _geometry(answers: Answers) -> Iterator[TomlSetting]:
     mount = answers.mount.value
     if mount == "beside":
         says = "a = R a_ref, R row by row; 1 0 0, 0 1 0, 0 0 1: the axes of sensor and reference are parallel"
@@ -110,7 +112,7 @@ def _geometry(answers: Answers) -> Iterator[Setting]:
             {"theta_deg": theta, "alpha_deg": alpha} for alpha in answers.alpha_deg.value or ()
         ]
         source = f"{answers.theta_deg.source}, {answers.alpha_deg.source}"
-        yield Setting("positions", stops, says, source, None, "deg")
+        yield TomlSetting("positions", stops, says, source, None, "deg")
         return
     g = answers.gravity_mps2.value
     stops = [{"gravity_mps2": _along(axis, sign * g)} for axis in range(3) for sign in (1, -1)]
@@ -118,17 +120,17 @@ def _geometry(answers: Answers) -> Iterator[Setting]:
         "what an ideal sensor indicates at rest in each position: once each axis up, once down. Put the sensor on each "
         "of its sides, in any order, for 20 s or longer: the agent finds position and time from gravity"
     )
-    yield Setting("positions", stops, says, source, None, "m/s2")
+    yield TomlSetting("positions", stops, says, source, None, "m/s2")
 
 
-def _up(answers: Answers) -> Setting:
+def _up(answers: Answers) -> TomlSetting:
     """Gravity beside a reference that does not feel it; of a seismometer, the third axis (Z) points up."""
     up = [answers.gravity_mps2.value * along for along in answers.rotation.value[2::3]]
     says = (
         "what an ideal sensor indicates at rest; the reference does not feel gravity. Here its third axis points up; "
         "where another one does, change this"
     )
-    return _setting(Channel, "rotation_gravity_mps2", Stated(up, "gravity_mps2 and rotation"), says, "m/s2")
+    return _setting(Channel, "rotation_gravity_mps2", SourcedValue(up, "gravity_mps2 and rotation"), says, "m/s2")
 
 
 def _along(axis: int, value: float) -> list[float]:
@@ -137,9 +139,9 @@ def _along(axis: int, value: float) -> list[float]:
     return vector
 
 
-def _prior(answers: Answers) -> Table:
+def _prior(answers: Answers) -> TomlTable:
     says = "output unit per m/s2, of the data sheet; without it the driver's nominal value is used"
-    return Table(
+    return TomlTable(
         "[channels.prior]",
         [
             _setting(Prior, "sensitivity", answers.sensitivity, says),
@@ -153,7 +155,7 @@ def _prior(answers: Answers) -> Table:
     )  # fmt: skip
 
 
-def _certificate(answers: Answers) -> Table:
+def _certificate(answers: Answers) -> TomlTable:
     settings = [
         _setting(Certificate, "quantity", answers.quantity, "what the reference measures"),
         _setting(
@@ -171,10 +173,10 @@ def _certificate(answers: Answers) -> Table:
             "standard uncertainty of the sensitivity that a year adds", "%",
         ),
     ]  # fmt: skip
-    return Table("[channels.certificate]", settings)
+    return TomlTable("[channels.certificate]", settings)
 
 
-def _uncertainty(answers: Answers) -> Table:
+def _uncertainty(answers: Answers) -> TomlTable:
     stated: Sequence[tuple[str, str, str]] = {
         "clamp": (
             ("theta_deg", "standard uncertainty of theta", "deg"),
@@ -190,21 +192,23 @@ def _uncertainty(answers: Answers) -> Table:
     gravity = _default(Uncertainty, "gravity_mps2")
     if answers.gravity_mps2.source != "default":
         u_mps2, why = u_of_gravity_mps2(answers.gravity_mps2.value)
-        gravity = Stated(float(f"{u_mps2:.2g}"), f"init, by the digits of gravity_mps2: {why}")
+        gravity = SourcedValue(float(f"{u_mps2:.2g}"), f"init, by the digits of gravity_mps2: {why}")
     settings = [_setting(Uncertainty, name, _default(Uncertainty, name), says, unit) for name, says, unit in stated]
     says = "standard uncertainty of gravity_mps2"
-    return Table("[channels.uncertainty]", [*settings, _setting(Uncertainty, "gravity_mps2", gravity, says, "m/s2")])
+    return TomlTable(
+        "[channels.uncertainty]", [*settings, _setting(Uncertainty, "gravity_mps2", gravity, says, "m/s2")]
+    )
 
 
-def _default(model: type[BaseModel], name: str) -> Stated[Any]:
-    return Stated(model.model_fields[name].default, "default")
+def _default(model: type[BaseModel], name: str) -> SourcedValue[Any]:
+    return SourcedValue(model.model_fields[name].default, "default")
 
 
-def _given(name: str, value: Any, says: str) -> Setting:
-    return Setting(name, value, says, "init")
+def _given(name: str, value: Any, says: str) -> TomlSetting:
+    return TomlSetting(name, value, says, "init")
 
 
-def _setting(model: type[BaseModel], name: str, stated: Stated[Any], says: str, unit: str = "") -> Setting:
+def _setting(model: type[BaseModel], name: str, stated: SourcedValue[Any], says: str, unit: str = "") -> TomlSetting:
     default = model.model_fields[name].default
     value = None if stated.value == "" and default == "" else stated.value
-    return Setting(name, value, says, stated.source, default, unit)
+    return TomlSetting(name, value, says, stated.source, default, unit)

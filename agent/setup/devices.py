@@ -9,13 +9,13 @@ from typing import Any, Literal, get_args
 import click
 from pydantic import ValidationError
 
-from agent.setup.asking import Asking, Stated
+from agent.setup.asking import Interview, SourcedValue
 from agent.setup.buses import bus_clock_khz
 from agent.setup.datagrams import hear_shake
 from agent.setup.drivers import describe, unit_of
-from agent.setup.listening import Heard, hear
+from agent.setup.listening import PortLines, hear
 from agent.setup.recognising import recognised
-from agent.setup.toml import Setting, Table
+from agent.setup.toml import TomlSetting, TomlTable
 from hw.fifo_options import FifoOptions, foreign_options
 from hw.line_columns import IGNORED, Column, columns_of
 from hw.sensor import ConfigurationError, load_driver
@@ -33,7 +33,7 @@ GRAVITY_G = (0.8, 1.2)
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ProbedDevice:
     """A device that the probe found: its driver, options that follow from its place, and a text for people."""
 
     driver: str
@@ -42,17 +42,17 @@ class Found:
 
 
 @dataclass(slots=True)
-class Chosen:
+class ChosenDevice:
     """The device of one role: its driver and its options, each with its source. `hint` helps where one is missing."""
 
     role: Role
-    driver: Stated[str]
-    options: dict[str, Stated[Any]] = field(default_factory=dict)
+    driver: SourcedValue[str]
+    options: dict[str, SourcedValue[Any]] = field(default_factory=dict)
     hint: str = ""
 
     def state(self, name: str, value: Any, source: str) -> None:
         """State an option, unless the user has stated it."""
-        self.options.setdefault(name, Stated(value, source))
+        self.options.setdefault(name, SourcedValue(value, source))
 
     def value(self, name: str) -> Any:
         """Value of an option; None where it is not stated."""
@@ -60,7 +60,7 @@ class Chosen:
         return None if stated is None else stated.value
 
 
-def listen(devices: list[Chosen], asking: Asking) -> None:
+def listen(devices: list[ChosenDevice], asking: Interview) -> None:
     """Listen to the devices that write lines of text or send datagrams, as far as their options are not all stated."""
     waiting = []
     for device in devices:
@@ -91,19 +91,19 @@ def listen(devices: list[Chosen], asking: Asking) -> None:
                 _state_unit(device, columns, told, asking.faults)
 
 
-def _ask(device: Chosen) -> bool:
+def _ask(device: ChosenDevice) -> bool:
     """Ask the device at a port without lines of text who it is; whether it answered. Its driver is then known."""
     if device.driver.source.startswith("option"):
         return False
     found = recognised(str(device.value("port")), device.value("baud_rate"))
     if found is not None:
-        device.driver = Stated(found.driver, "the device answered on the port")
+        device.driver = SourcedValue(found.driver, "the device answered on the port")
         for name, value in found.options.items():
             device.state(name, value, "the device answered on the port")
     return found is not None
 
 
-def _hear_shake(device: Chosen, asking: Asking) -> None:
+def _hear_shake(device: ChosenDevice, asking: Interview) -> None:
     """State the channels and the rate of the Raspberry Shake that sends to this computer."""
     option = f"--{device.role}-option"
     stated = {name: held.value for name, held in device.options.items()}
@@ -116,7 +116,7 @@ def _hear_shake(device: Chosen, asking: Asking) -> None:
         device.state("channels", [], "missing")  # the fault is told once
         return
     device.state("rate_hz", told.nominal_hz, f"counted on the port: {told.counted_hz:.4g} Hz")
-    held = Stated(told.channels, "heard on the port")
+    held = SourcedValue(told.channels, "heard on the port")
     if not held.value:
         question = (
             f"{device.role}: one channel, or three for x, y, z, with commas; those that came: {', '.join(told.came)}"
@@ -125,7 +125,7 @@ def _hear_shake(device: Chosen, asking: Asking) -> None:
     device.state("channels", list(held.value or ()), held.source)
 
 
-def _stated_columns(device: Chosen) -> tuple[Column, ...]:
+def _stated_columns(device: ChosenDevice) -> tuple[Column, ...]:
     """The columns as the user states them: by `columns`, or by axes and sequence; () where they are not stated."""
     stated = {name: held.value for name in ("columns", "axes", "sequence") if (held := device.options.get(name))}
     if "columns" not in stated and len(stated) < 2:
@@ -136,11 +136,11 @@ def _stated_columns(device: Chosen) -> tuple[Column, ...]:
         return ()  # the check of the whole configuration names the fault
 
 
-def _columns(device: Chosen, heard: Heard, asking: Asking) -> tuple[Column, ...]:
+def _columns(device: ChosenDevice, heard: PortLines, asking: Interview) -> tuple[Column, ...]:
     """State the columns of the lines as heard, or as answered, unless the user has stated them; () where they are not
     known or contradict what the user has stated."""
     option, count = f"--{device.role}-option columns=[...]", len(heard.means)
-    held = Stated(_stated_columns(device) or heard.columns, "seen on the port")
+    held = SourcedValue(_stated_columns(device) or heard.columns, "seen on the port")
     if "columns" in device.options and not _stated_columns(device):
         return ()
     if not held.value:
@@ -175,7 +175,7 @@ def _axes(columns: Sequence[Column]) -> int:
     return sum(name in ("x", "y", "z", "a") for name in columns)
 
 
-def _state_columns(device: Chosen, columns: tuple[Column, ...], source: str) -> None:
+def _state_columns(device: ChosenDevice, columns: tuple[Column, ...], source: str) -> None:
     """State axes and sequence, and the columns too where these two do not tell all."""
     axes, sequence = _axes(columns), "seq" in columns
     device.state("axes", axes, source)
@@ -197,7 +197,7 @@ def _names(answer: str) -> tuple[str, ...]:
     return names
 
 
-def _state_unit(device: Chosen, columns: tuple[Column, ...], heard: Heard, faults: list[str]) -> None:
+def _state_unit(device: ChosenDevice, columns: tuple[Column, ...], heard: PortLines, faults: list[str]) -> None:
     axes = [at for at, name in enumerate(columns) if name in ("x", "y", "z")]
     if "unit" in device.options or not axes:
         return
@@ -219,7 +219,7 @@ def _state_unit(device: Chosen, columns: tuple[Column, ...], heard: Heard, fault
     )
 
 
-def complete(device: Chosen, asking: Asking) -> None:
+def complete(device: ChosenDevice, asking: Interview) -> None:
     """State every option of the driver: those that the user and the probe left out from the driver's defaults."""
     try:
         model = load_driver(device.driver.value).options_model
@@ -239,11 +239,11 @@ def complete(device: Chosen, asking: Asking) -> None:
             says = option.get("description", name) + (f", {unit}" if unit else "")
             kind = _texts if option.get("items", {}).get("type") == "string" else None
             asked = asking.value(f"--{device.role}-option {name}=VALUE", None, f"{device.role}: {says}", kind=kind)
-            device.options[name] = Stated(asked.value, asked.source)
+            device.options[name] = SourcedValue(asked.value, asked.source)
         device.state(name, option.get("default"), "default")
 
 
-def _fit_bus(device: Chosen, model: type[FifoOptions]) -> None:
+def _fit_bus(device: ChosenDevice, model: type[FifoOptions]) -> None:
     """State the clock of the bus as the system tells it, and the highest usual rate that fits it without advice."""
     bus = device.value("bus")
     clock_khz = None if isinstance(bus, str) else bus_clock_khz(bus)
@@ -265,13 +265,13 @@ def _fit_bus(device: Chosen, model: type[FifoOptions]) -> None:
         return
 
 
-def tables_of(device: Chosen) -> Iterator[Table]:
+def tables_of(device: ChosenDevice) -> Iterator[TomlTable]:
     """The tables of a device."""
-    yield Table(
+    yield TomlTable(
         "[[devices]]",
         [
-            Setting("name", device.role, "name of this device in results and messages", "role of the device"),
-            Setting("driver", device.driver.value, "driver; `fieldcal sensors` lists all", device.driver.source),
+            TomlSetting("name", device.role, "name of this device in results and messages", "role of the device"),
+            TomlSetting("driver", device.driver.value, "driver; `fieldcal sensors` lists all", device.driver.source),
         ],
     )
     schema = describe(device.driver.value).options
@@ -281,5 +281,5 @@ def tables_of(device: Chosen) -> Iterator[Table]:
         option = properties.get(name, {})
         says = str(option.get("description", name.replace("_", " ")))
         default = None if name in required else option.get("default")
-        settings.append(Setting(name, stated.value, says, stated.source, default, unit_of(name)))
-    yield Table("[devices.options]", settings)
+        settings.append(TomlSetting(name, stated.value, says, stated.source, default, unit_of(name)))
+    yield TomlTable("[devices.options]", settings)

@@ -13,7 +13,7 @@ import numpy as np
 import serial
 
 from hw.line_columns import AXES, IGNORED, Column, kind_of
-from hw.lines import MOST_COLUMNS, Decoded, decode, with_newlines
+from hw.lines import MOST_COLUMNS, DecodedLines, decode, with_newlines
 from hw.serial_sensor import LOST, READ_BYTES, reason_of
 
 FIRST_LINE_S = 5.0  # opening the port restarts some boards, which need two seconds
@@ -35,7 +35,7 @@ TRIED_LINES = 500  # from which the number of columns is found
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class PortLines:
     """Lines of one port: the columns, None where they cannot be told apart, and the mean of each; the rate (Hz) as
     counted and as it is probably meant; whether a column is of whole numbers only; the last line."""
 
@@ -48,7 +48,7 @@ class Heard:
 
 
 @dataclass(slots=True)
-class _Line:
+class _PortBytes:
     """One port: bytes and the number of bytes at each arrival."""
 
     port: serial.Serial
@@ -56,14 +56,14 @@ class _Line:
     arrivals: list[tuple[float, int]] = field(default_factory=list)
 
 
-def hear(ports: Mapping[str, int]) -> dict[str, Heard | str]:
+def hear(ports: Mapping[str, int]) -> dict[str, PortLines | str]:
     """Listen to all ports at the same time; `ports` is the baud rate by path. Where nothing is heard: why.
 
     Some devices wait for each other: a bench sends nothing from one port until the other is open too.
     """
-    found: dict[str, Heard | str] = {}
+    found: dict[str, PortLines | str] = {}
     with ExitStack() as stack:
-        lines: dict[str, _Line] = {}
+        lines: dict[str, _PortBytes] = {}
         for path, baud_rate in ports.items():
             try:
                 port = serial.Serial(path, baud_rate, timeout=0, exclusive=True)
@@ -71,14 +71,14 @@ def hear(ports: Mapping[str, int]) -> dict[str, Heard | str]:
                 found[path] = f"cannot be opened: {reason_of(error)}"
                 continue
             stack.callback(port.close)
-            lines[path] = _Line(port)
+            lines[path] = _PortBytes(port)
         _collect(lines)
         for path, line in lines.items():
             found[path] = _understood(line, ports[path])
     return found
 
 
-def _collect(lines: Mapping[str, _Line]) -> None:
+def _collect(lines: Mapping[str, _PortBytes]) -> None:
     with selectors.DefaultSelector() as selector:
         for line in lines.values():
             selector.register(line.port.fileno(), selectors.EVENT_READ, line)
@@ -98,7 +98,7 @@ def _collect(lines: Mapping[str, _Line]) -> None:
                 latest_s, ends = time.monotonic() + LISTEN_S, True
 
 
-def _understood(line: _Line, baud_rate: int) -> Heard | str:
+def _understood(line: _PortBytes, baud_rate: int) -> PortLines | str:
     if not line.arrivals:
         return f"nothing was sent within {FIRST_LINE_S:g} s"
     begin = line.data.find(b"\n", line.arrivals[0][1] - 1) + 1  # the first arrival tells when counting begins
@@ -118,7 +118,7 @@ def _understood(line: _Line, baud_rate: int) -> Heard | str:
     if len(arrivals) < 2:
         return f"all lines came at once at {baud_rate} baud, so their rate is not known"
     counted_hz = _octets_per_s(arrivals) * len(values) / octets
-    return Heard(
+    return PortLines(
         _columns([kind_of(column, counted_hz) for column in values.T]),
         tuple(values.mean(axis=0).tolist()),
         tuple((values % 1 == 0).all(axis=0).tolist()),
@@ -143,7 +143,7 @@ def _columns(kinds: Sequence[Column | None]) -> tuple[Column, ...] | None:
     return tuple(columns)
 
 
-def _why(decoded: Decoded, lines: Sequence[bytes], count: int) -> str:
+def _why(decoded: DecodedLines, lines: Sequence[bytes], count: int) -> str:
     """What is wrong with the last line that cannot be read; "" without one."""
     if not decoded.bad_at:
         return ""

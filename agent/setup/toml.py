@@ -12,7 +12,7 @@ WIDTH = 100  # characters of a comment's line
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class TomlSetting:
     """One value of a configuration. `value` None: the line is a comment, which shows how the setting is written.
 
     `source`: where the value comes from, such as `default` or `found on the bus`.
@@ -27,14 +27,14 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class TomlTable:
     """A table of TOML with its header, such as `[[channels]]`."""
 
     header: str
-    settings: Sequence[Setting]
+    settings: Sequence[TomlSetting]
 
 
-def written(title: str, tables: Iterable[Table]) -> str:
+def written(title: str, tables: Iterable[TomlTable]) -> str:
     """The text of a file. `title` stands at its top."""
     lines = [*_comment(title)]
     for table in tables:
@@ -61,7 +61,7 @@ def toml_value(value: Any) -> str:
     return "[" + ", ".join(entries) + "]"
 
 
-def _lines(setting: Setting) -> Iterator[str]:
+def _lines(setting: TomlSetting) -> Iterator[str]:
     default = "none" if setting.default is None else toml_value(setting.default)
     unit = f" Unit: {setting.unit}." if setting.unit else ""
     says = setting.says.strip().rstrip(".")

@@ -125,7 +125,7 @@ class JsonLog(logging.Handler):
             return  # whoever read the log went away; the agent goes on
 
 
-class _Lines(io.TextIOBase):
+class _StandardError(io.TextIOBase):
     """Stands in for standard error: each line that is printed there becomes a record."""
 
     def __init__(self) -> None:
@@ -150,7 +150,7 @@ def log_as_json() -> JsonLog:
     root.setLevel(logging.INFO)
     logging.captureWarnings(True)
     logging.raiseExceptions = False
-    sys.stderr = _Lines()
+    sys.stderr = _StandardError()
     return log
 
 

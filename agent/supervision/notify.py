@@ -14,7 +14,7 @@ FEED_FRACTION = 0.25  # of the watchdog's time between two messages; systemd adv
 STATUS_MAX = 400  # characters that `systemctl status` shows in a line
 
 
-class Notifier:
+class SystemdNotifier:
     """Sends notifications; none of its methods blocks or raises.
 
     `environment`: has the socket and the watchdog's time (NOTIFY_SOCKET, WATCHDOG_USEC, WATCHDOG_PID). These variables

@@ -28,7 +28,7 @@ MOST_DRIFTS = 120  # ten changes of verdict of each of the twelve parameters
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
-class Waiting(Protocol):
+class QueueFill(Protocol):
     """A bounded queue: the number of entries that wait in it, and the number at which it is full."""
 
     @property
@@ -81,7 +81,7 @@ class Plant:
     """The parts of one run. The main loop may read them at any time; no method waits."""
 
     data_dir: Path
-    events: Waiting
+    events: QueueFill
     writer: RecordingThread
     recorder: Recorder
     outbox: Outbox

@@ -13,7 +13,7 @@ from agent.config import Config
 from agent.core.events import DriftReport, Event, Result, Tick, WindowReport
 from agent.supervision.health import GatewayStatus, Health, State
 from agent.supervision.logs import log_event, tell
-from agent.supervision.notify import Notifier
+from agent.supervision.notify import SystemdNotifier
 from agent.supervision.plant import Plant
 from hw.block import SampleBlock
 
@@ -29,7 +29,7 @@ class Supervisor:
     meanwhile.
     """
 
-    def __init__(self, config: Config, run_id: str, origin_ns: int, plant: Plant, notifier: Notifier) -> None:
+    def __init__(self, config: Config, run_id: str, origin_ns: int, plant: Plant, notifier: SystemdNotifier) -> None:
         self._settings = config.supervision
         self._health = Health(config, __version__, run_id, origin_ns)
         self._plant = plant

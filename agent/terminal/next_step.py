@@ -42,7 +42,7 @@ REMEDIES = (
 
 
 @dataclass
-class Seen:
+class SensorProgress:
     """What has happened at one sensor in this run. `estimate`: number of an estimate that waits, 0 for none."""
 
     status: str = ""
@@ -76,12 +76,12 @@ class Seen:
             self.on_hold |= any(isinstance(result, CalibrationUpdate) for result in results)
 
 
-class Guide:
+class NextSteps:
     """Follows a run, and says what to do next at each sensor. `turns_itself`: a virtual bench, where nobody turns."""
 
     def __init__(self, config: Config, *, turns_itself: bool) -> None:
         self._channels = {channel.sensor: channel for channel in config.channels}
-        self._seen = {sensor: Seen() for sensor in self._channels}
+        self._seen = {sensor: SensorProgress() for sensor in self._channels}
         self._lost: dict[str, str] = {}  # why, by device
         self._commands, self._turns_itself = config.commands.enabled, turns_itself
 
@@ -97,7 +97,7 @@ class Guide:
             self._seen[result.sensor].take(result)
         return {sensor: self._next(self._channels[sensor], seen) for sensor, seen in self._seen.items() if seen.status}
 
-    def _of_lost(self, channel: Channel, seen: Seen) -> str:
+    def _of_lost(self, channel: Channel, seen: SensorProgress) -> str:
         """What to do about devices that are lost; "" where none is."""
         devices = [channel.sensor, *(c.reference for c in channel.by_reference if c.reference)]
         lost = [name for name in devices if name in self._lost]
@@ -111,7 +111,7 @@ class Guide:
             "`fieldcal doctor` names faults too"
         )
 
-    def _next(self, channel: Channel, seen: Seen) -> str:
+    def _next(self, channel: Channel, seen: SensorProgress) -> str:
         if lost := self._of_lost(channel, seen):
             return lost
         if seen.on_hold:
@@ -140,7 +140,7 @@ class Guide:
         return f"if this change is real: `{command}`; if not, check mount and reference"
 
     @staticmethod
-    def _watch(seen: Seen) -> str:
+    def _watch(seen: SensorProgress) -> str:
         """Without a reference nothing calibrates the sensor here."""
         if seen.status == "VALID":
             return "nothing has to be done; without a reference U grows until the next visit (`fieldcal visit`)"
@@ -155,7 +155,7 @@ class Guide:
         more = "more motion makes" if channel.fixed_mount else "more positions make"
         return f"nothing has to be done; {more} U smaller. `fieldcal certificate` makes the certificate"
 
-    def _turn(self, channel: Channel, seen: Seen) -> str:
+    def _turn(self, channel: Channel, seen: SensorProgress) -> str:
         if channel.gate.policy == "observe":
             return 'nothing: with policy = "observe" windows are reported, and no calibration comes into force'
         if self._turns_itself:
@@ -169,7 +169,7 @@ class Guide:
         return _stated(channel, seen) or "state further positions: those of the configuration are over"
 
 
-def _mend(seen: Seen) -> str:
+def _mend(seen: SensorProgress) -> str:
     numbers = seen.newest.numbers if seen.newest else {}
     for name, sign, remedy in REMEDIES:
         if name in numbers and sign * (numbers[name] - numbers.get(f"{name}_threshold", numbers[name])) > 0:
@@ -177,7 +177,7 @@ def _mend(seen: Seen) -> str:
     return "mend what the reason of the newest windows names: they are refused one after the other"
 
 
-def _stated(channel: Channel, seen: Seen) -> str | None:
+def _stated(channel: Channel, seen: SensorProgress) -> str | None:
     """Which of the stated positions is next; None if the configuration states no further one."""
     if channel.poses:
         return _timed(channel, seen)
@@ -189,7 +189,7 @@ def _stated(channel: Channel, seen: Seen) -> str | None:
     return f"{_taken(left[0])} and stay {STAY_S} s (positions used: {used} of {len(stops)})"
 
 
-def _timed(channel: Channel, seen: Seen) -> str | None:
+def _timed(channel: Channel, seen: SensorProgress) -> str | None:
     """The next pose with times, first one that no window used; None after the last one."""
     after_s = seen.newest.stop_s if seen.newest else 0.0
     period_s = channel.poses_repeat_s

@@ -37,7 +37,7 @@ class Screen:
 
     def __init__(self, state: ViewState, stream: TextIO) -> None:
         self._live = Live(
-            Picture(state),
+            ScreenPicture(state),
             console=TextConsole(stream),
             auto_refresh=False,
             vertical_overflow="crop",
@@ -62,7 +62,7 @@ class Screen:
                 self._live.stop()
 
 
-class Picture:
+class ScreenPicture:
     """The state as lines for a console of any width and height; windows and messages share the lines that are left."""
 
     def __init__(self, state: ViewState) -> None:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from agent.delivery.publication import PublicationState
 
 
-class Truth(Protocol):
+class ShownTruth(Protocol):
     """True values of a virtual sensor: S (3, 3) in output unit per m/s2, Q (3,) in output unit."""
 
     @property
@@ -58,7 +58,7 @@ class ViewState:
     calibrations: dict[str, CalibrationUpdate] = field(default_factory=dict)
     statuses: dict[str, StatusChange] = field(default_factory=dict)
     next_steps: dict[str, str] = field(default_factory=dict)  # by sensor: what a person can do next
-    truths: dict[str, Truth] = field(default_factory=dict)
+    truths: dict[str, ShownTruth] = field(default_factory=dict)
     publication: PublicationState | None = None
     recording: RecordingState | None = None
     messages: deque[str] = field(default_factory=lambda: deque(maxlen=50))

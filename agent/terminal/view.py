@@ -26,7 +26,7 @@ def open_view(state: ViewState, stream: TextIO, *, lines: bool = True) -> View:
         from agent.terminal.screen import Screen
 
         return Screen(state, stream)
-    return Lines(state, stream) if lines else Nothing()
+    return LineView(state, stream) if lines else Nothing()
 
 
 class Nothing:
@@ -39,7 +39,7 @@ class Nothing:
         """Do nothing."""
 
 
-class Lines:
+class LineView:
     """Writes one line for each event: for logs, pipes and journals."""
 
     def __init__(self, state: ViewState, stream: TextIO) -> None:

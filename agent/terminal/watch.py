@@ -12,9 +12,9 @@ from agent.config import Config
 from agent.core.events import DeviceChange, Event, Gap, Result, Tick
 from agent.delivery.publication import PublicationState
 from agent.recording.writer import Recorder
-from agent.terminal.next_step import Guide
+from agent.terminal.next_step import NextSteps
 from agent.terminal.quantity import counted
-from agent.terminal.state import DeviceState, RecordingState, Truth, ViewState
+from agent.terminal.state import DeviceState, RecordingState, ShownTruth, ViewState
 from agent.terminal.view import open_view
 from agent.terminal.wording import gap_line
 from hw.block import BlockFlags, SampleBlock
@@ -25,14 +25,14 @@ SLOW_REMEDY = "end other programs; --rate-hz 250 asks less of it than 1000"
 RATE_OVER_BLOCKS = 20  # the shown rate is a mean over this many blocks, ten seconds
 
 
-class Watch(logging.Handler):
+class RunView(logging.Handler):
     """The view of a run. Only the main loop calls `update` and `health`; `say` and log records may come from any
     thread.
 
     `lines`: whether what happens is written where there is no terminal; a log that tells it makes them superfluous.
     """
 
-    def __init__(self, config: Config, title: str, truth: Truth | None, *, lines: bool = True) -> None:
+    def __init__(self, config: Config, title: str, truth: ShownTruth | None, *, lines: bool = True) -> None:
         super().__init__(logging.WARNING)
         gateway = config.gateway
         self._lines = lines
@@ -43,12 +43,12 @@ class Watch(logging.Handler):
         self._arrivals: dict[str, deque[tuple[int, int]]] = {
             d.name: deque(maxlen=RATE_OVER_BLOCKS) for d in config.devices
         }
-        self._guide = Guide(config, turns_itself=truth is not None)
+        self._guide = NextSteps(config, turns_itself=truth is not None)
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._began_s = time.monotonic()
         self._simulated, self._told_slow_s = truth is not None, -SLOW_TOLD_S
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> RunView:
         self._view = open_view(self.state, sys.stdout, lines=self._lines)
         logging.getLogger("agent").addHandler(self)
         return self

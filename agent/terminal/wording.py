@@ -27,13 +27,13 @@ from calib.rounding import plus_minus
 
 if TYPE_CHECKING:
     from agent.delivery.publication import PublicationState
-    from agent.terminal.state import RecordingState, Truth
+    from agent.terminal.state import RecordingState, ShownTruth
 
 COVERAGE_FACTOR = 2.0  # of U in texts, for about 95 % coverage
 STATUS_STYLES = {"VALID": "bold green", "HELD": "yellow", "RECALIBRATING": "yellow", "INVALID": "bold red"}
 
 
-def result_lines(result: Result, truth: Truth | None) -> list[str]:
+def result_lines(result: Result, truth: ShownTruth | None) -> list[str]:
     """A result as lines of text."""
     match result:
         case WindowReport():
@@ -144,7 +144,7 @@ def calibration_rows(calibration: CalibrationUpdate) -> list[str]:
     ]
 
 
-def truth_line(calibration: CalibrationUpdate, truth: Truth) -> str:
+def truth_line(calibration: CalibrationUpdate, truth: ShownTruth) -> str:
     """Largest errors of S and Q against a virtual sensor; S in percent of the main sensitivity of its row, Q in
     m/s2."""
     main = np.diag(truth.sensitivity)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from agent.recording.records import RecordError
+from agent.recording.records import FileRecordError
 from benchmarks.attacks.site import Attack, Site, at
 from tests.replay.forgery import records, with_sums
 
@@ -70,5 +70,5 @@ def summary_edited(data: Path, _: Site, place: int) -> None:
     content[where] ^= 0x40
     try:
         path.write_bytes(with_sums(bytes(content)))
-    except RecordError:  # the records cannot be walked any longer
+    except FileRecordError:  # the records cannot be walked any longer
         path.write_bytes(content)

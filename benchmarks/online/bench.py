@@ -28,7 +28,7 @@ from benchmarks.online.clamp import bench_events
 from benchmarks.online.runner import Run
 from calib.model import PARAMETERS, Array
 from hw.virtual.bench import Bench
-from hw.virtual.noise import Stream
+from hw.virtual.noise import NoiseStream
 from hw.virtual.presets import plain
 from hw.virtual.schedule import Schedule, clamped
 from hw.virtual.spread import Spread, drawn
@@ -93,7 +93,7 @@ def world(seed: int, rate_hz: float = RATES_HZ[0]) -> Bench:
             bursts=replace(p.reference.bursts, apart_s=1.0 / rate_hz),
         ),
     )
-    return Bench(drawn(turned, KNOWN, np.random.default_rng([seed, Stream.PRESET])), seed)
+    return Bench(drawn(turned, KNOWN, np.random.default_rng([seed, NoiseStream.PRESET])), seed)
 
 
 def config(bench: Bench, **keys: Any) -> Config:

@@ -22,10 +22,10 @@ from benchmarks.online.life import MAIN, House
 from benchmarks.online.node import adxl355
 from calib.geometry import AXES
 from calib.model import Array
-from hw.virtual.building import DAY_S, Building, BuildingParameters, BuildingTruth, Instrument, Weather
+from hw.virtual.building import DAY_S, Building, BuildingDevice, BuildingParameters, BuildingTruth, Weather
 from hw.virtual.building_motion import BuildingMotion, ComplexArray
 from hw.virtual.harm import Harm, Visit
-from hw.virtual.noise import Stream
+from hw.virtual.noise import NoiseStream
 from hw.virtual.response import Response
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
 from hw.virtual.timebase import Bursts, Clock
@@ -115,8 +115,8 @@ class Bridge(Building):
         rate = night + (day - night) * max(np.sin(np.pi * (hour - 5) / 16), 0.0)
         return int(np.random.default_rng([self.seed, visit]).poisson(rate * WINDOW_S / 60.0))
 
-    def _motion(self, visit: int, stream: Stream, response: Response | None = None) -> BuildingMotion:
-        if stream != Stream.BUILDING_MOTION:
+    def _motion(self, visit: int, stream: NoiseStream, response: Response | None = None) -> BuildingMotion:
+        if stream != NoiseStream.BUILDING_MOTION:
             return Moved(np.zeros_like)  # type: ignore[return-value]  # nothing happens that needs it
         random, (start_s, stop_s) = np.random.default_rng([self.seed, int(stream), visit]), self.span(visit)
         pad_s = 15.0  # the bridge does not stand still before a window, nor an AC reference
@@ -256,7 +256,7 @@ def world(seed: int, reference: str, sensor: str = SENSORS[0]) -> World:
         weather=Weather(20.0, 0.0, random.uniform(2.5, 5.0)),
         reference_sensitivity=_reads(random),
         sensor=_sensor(sensor, 3e-5 * random.standard_normal(), usb),
-        reference=Instrument(
+        reference=BuildingDevice(
             0.0005, Clock(200.0, 3e-5 * random.standard_normal(), 0.0004), late=usb,
             response=ac if reference == "AC" else None,
         ),
@@ -271,10 +271,10 @@ def world(seed: int, reference: str, sensor: str = SENSORS[0]) -> World:
     return World(made, later, config, turn)
 
 
-def _sensor(name: str, rate_error: float, late: Bursts) -> Instrument:
+def _sensor(name: str, rate_error: float, late: Bursts) -> BuildingDevice:
     if name == SENSORS[1]:
-        return Instrument(NOISE_OF_12_BITS_MPS2, Clock(200.0, rate_error, 0.0013, 2e-5), late=late)
-    return adxl355(Instrument(0.003, Clock(250.0, rate_error, 0.0013, 2e-5), late=late), 250.0)
+        return BuildingDevice(NOISE_OF_12_BITS_MPS2, Clock(200.0, rate_error, 0.0013, 2e-5), late=late)
+    return adxl355(BuildingDevice(0.003, Clock(250.0, rate_error, 0.0013, 2e-5), late=late), 250.0)
 
 
 def _reads(random: np.random.Generator) -> Array:

@@ -17,7 +17,7 @@ from benchmarks.online.node import Stated, Timing, adxl355, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from calib.model import Array
 from hw.virtual.building import Building
-from hw.virtual.building_motion import Band
+from hw.virtual.building_motion import BuildingSpectrum
 
 SEED, RUNS = 95_000, 20  # runs of each line
 TIMING = Timing(20.0, 60.0, 10)
@@ -57,7 +57,9 @@ def one(job: Job) -> Outcome:
     sensor = adxl355(parameters.sensor, rate_hz)
     sensor = replace(sensor, filters=sensor.filters if kind != "nothing" else ())
     reference = replace(parameters.reference, filters=("flat",) if kind == "both" else ())
-    building = Building(replace(parameters, band=Band(0.5, to_hz), sensor=sensor, reference=reference), seed)
+    building = Building(
+        replace(parameters, band=BuildingSpectrum(0.5, to_hz), sensor=sensor, reference=reference), seed
+    )
     run, first, update, status, used = Run(drawn.config), None, None, "", 0
     for event in visits(building, range(TIMING.windows)):
         for result in run.feed(event):

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from agent.core.events import Event
 from benchmarks.online.runner import EPOCH_NS, opened, tick, ticked
 from hw.block import DeviceInfo, SampleBlock
-from hw.virtual.bench import Bench, Recording
+from hw.virtual.bench import Bench, BenchRecording
 
 BLOCK_S = 5.0
 Array = NDArray[np.float64]
 
 
-def bench_events(bench: Bench, recording: Recording) -> Iterator[Event]:
+def bench_events(bench: Bench, recording: BenchRecording) -> Iterator[Event]:
     """Openings and blocks of a recording of this bench, in order of arrival; devices "sensor" and "reference"."""
     p = bench.parameters
     sensor_hz, reference_hz = p.sensor.clock.nominal_rate_hz, p.reference.clock.nominal_rate_hz

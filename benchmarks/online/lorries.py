@@ -25,8 +25,8 @@ from calib.windows.bands import band_sums, beside_noise
 from calib.windows.record import Record
 from calib.windows.sums import window_sums
 from hw.virtual.building import Building, BuildingParameters
-from hw.virtual.building_motion import Band, BuildingMotion
-from hw.virtual.noise import Stream
+from hw.virtual.building_motion import BuildingMotion, BuildingSpectrum
+from hw.virtual.noise import NoiseStream
 from hw.virtual.response import Response
 from tests.pair import lowpass
 
@@ -36,7 +36,7 @@ TIMING = Timing(60.0, 3600.0, WINDOWS)
 FAST_HZ = (15.0, 50.0)  # of the bumps
 LASTING = 4.0  # cycles until a bump is strongest; after four times as many it is a fifth of that
 A_MINUTE = 10
-LEVEL, BAND = (0.02, 0.1), Band(0.5, 12.0)
+LEVEL, BAND = (0.02, 0.1), BuildingSpectrum(0.5, 12.0)
 PEAK_MPS2 = 0.04
 FILTER = lowpass(4, 35.0)
 POINTS_A_PERIOD = 64  # of the fastest bump: cubic pieces are then accurate to 1e-6
@@ -78,7 +78,7 @@ class Roadside(Building):
         super().__init__(parameters, seed)
         self._busy = busy
 
-    def _motion(self, visit: int, stream: Stream, response: Response | None = None) -> BuildingMotion:
+    def _motion(self, visit: int, stream: NoiseStream, response: Response | None = None) -> BuildingMotion:
         quiet = super()._motion(visit, stream, response)
         if visit not in self._busy:
             return quiet

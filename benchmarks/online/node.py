@@ -11,8 +11,8 @@ from agent.config import Config
 from benchmarks.online.config import building_config
 from hw import adxl355_registers
 from hw.virtual import adxl355_twin
-from hw.virtual.building import Building, BuildingParameters, Instrument, Weather
-from hw.virtual.building_motion import Band
+from hw.virtual.building import Building, BuildingDevice, BuildingParameters, Weather
+from hw.virtual.building_motion import BuildingSpectrum
 from hw.virtual.harm import HARMLESS, Harm
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
 from hw.virtual.timebase import Clock
@@ -85,7 +85,7 @@ class Node:
     stated: Stated = field(default_factory=Stated)
 
 
-def adxl355(instrument: Instrument, rate_hz: float) -> Instrument:
+def adxl355(instrument: BuildingDevice, rate_hz: float) -> BuildingDevice:
     """The instrument as an ADXL355 at this output data rate: with the chip's filters, which its driver states."""
     return replace(
         instrument,
@@ -118,7 +118,7 @@ def node(
     parameters = BuildingParameters(
         window_s=timing.window_s,
         every_s=timing.every_s,
-        band=Band(0.5, 12.0),
+        band=BuildingSpectrum(0.5, 12.0),
         all_axes=all_axes,
         across=transverse,
         sensitivity=np.eye(3) + np.where(np.eye(3), main, across) * random.standard_normal((3, 3)),
@@ -128,8 +128,8 @@ def node(
         gravity_mps2=gravity * (1 + stated.gravity_mps2 / STANDARD_GRAVITY_MPS2 * random.standard_normal()),
         reference_sensitivity=np.diag(1 + stated.reference_pct / 100 * random.standard_normal(3)),
         weather=Weather(15.0, 0.0, 0.0),
-        sensor=Instrument(0.005, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0013, 20e-6)),
-        reference=Instrument(0.001, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0004)),
+        sensor=BuildingDevice(0.005, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0013, 20e-6)),
+        reference=BuildingDevice(0.001, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0004)),
     )
     if chip_hz is not None:
         parameters = replace(parameters, sensor=adxl355(parameters.sensor, chip_hz))

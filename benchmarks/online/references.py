@@ -12,7 +12,7 @@ from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 from benchmarks.online.config import building_config
 from benchmarks.online.node import RATE_HZ, Stated, Timing, node
 from benchmarks.online.runner import Run, visits
-from hw.virtual.building import Building, Instrument
+from hw.virtual.building import Building, BuildingDevice
 from hw.virtual.harm import Role
 from hw.virtual.schedule import rotation
 from hw.virtual.timebase import Clock
@@ -63,7 +63,7 @@ def one(job: tuple[Role | None, int, bool]) -> Judged:
     if stepped in ("reference", "check"):
         own = {"reference_steps": ((stepped, at_s, 1 + STEP),)}
     if both:
-        own["check"] = Instrument(0.001, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0007))
+        own["check"] = BuildingDevice(0.001, Clock(RATE_HZ, 1e-4 * random.standard_normal(), 0.0007))
         own["check_sensitivity"] = gains @ rotation(vector / angle, angle)
     building = Building(replace(drawn, **own), seed)  # type: ignore[arg-type]
     keys = stated.keys()

@@ -23,7 +23,7 @@ from calib.estimate.determined import Flags, determined
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare
-from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
+from calib.estimate.response_told import KnownResponses, ResponseTold, response_told, told_at_one_frequency
 from calib.model import Array, Calibration, Window
 from calib.windows.bands import motion_band_hz
 from calib.windows.condense import Condensed, condense, effective
@@ -236,7 +236,7 @@ def _response(
         priors.reference_frequency_hz,
         band_hz,
         k,
-        known=Known.of(priors),
+        known=KnownResponses.of(priors),
     )
 
 

@@ -34,7 +34,7 @@ UNSEEN_SHARE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class WhitenedRows:
     """Whitened residuals (observed minus predicted), and the derivatives of the predictions.
 
     Slopes: `slope` (W, 2M, 3) and `d_slope` (W, 2M, 3, N); means: `mean` (W, 3) and `d_mean` (W, 3, N); what the bands
@@ -175,7 +175,7 @@ class Equations:
         outputs = float((data.slopes[:, :m] ** 2).sum() + (level**2).sum())
         return float(np.sqrt(outputs / inputs)) if inputs > 0.0 and outputs > 0.0 else 1.0
 
-    def at(self, x: Array) -> Rows:
+    def at(self, x: Array) -> WhitenedRows:
         """Residuals and derivatives at x = [S row by row, Q, nuisances] (N,)."""
         data, n, w = self.data, len(x), len(self._pose_of)
         inputs = (self._effect @ x[12:])[self._pose_of]
@@ -193,7 +193,7 @@ class Equations:
         jacobians[0] /= noise[..., None]
         white = [self.scatter.whiten(part) for part in (slope / noise, jacobians[0])]
         shape, weight = data.slopes.shape, self.mean_weight
-        return Rows(
+        return WhitenedRows(
             white[0].reshape(shape), white[1].reshape(*shape, n), mean * weight, jacobians[1] * weight[..., None],
             *self._bands(x[12:]),
         )  # fmt: skip

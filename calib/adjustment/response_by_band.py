@@ -14,7 +14,7 @@ import numpy as np
 from calib.adjustment.adjustment import Adjustment
 from calib.distributions import chi2_quantile
 from calib.estimate.quantities import LAG, RESPONSE
-from calib.estimate.response_told import BandSensitivity, Known, ResponseTold
+from calib.estimate.response_told import BandSensitivity, KnownResponses, ResponseTold
 from calib.model import Array, BandSums, Pose, Window
 from calib.signal.response import Complex
 from calib.windows.banded import Factors
@@ -43,7 +43,7 @@ def told_by_band(found: Adjustment, windows: Sequence[Window]) -> ResponseTold |
     edges_hz = np.geomspace(told.bands[0].low_hz, told.bands[-1].high_hz, k + 1)
     middles_hz = np.sqrt(edges_hz[:-1] * edges_hz[1:])
     left_s = sum(float(x) for x, t in zip(grounds.solution.x[12:], terms.terms, strict=True) if t.kind is LAG)
-    taken = np.exp(2j * np.pi * middles_hz * left_s) * Known.of(grounds.priors).size(
+    taken = np.exp(2j * np.pi * middles_hz * left_s) * KnownResponses.of(grounds.priors).size(
         middles_hz, told.reference_frequency_hz
     )
     sources = dict.fromkeys(t.source for t in terms.terms if t.kind is not RESPONSE)
@@ -67,7 +67,7 @@ def _bands(windows: Sequence[_Moved], edges_hz: Array, taken: Complex, stated: A
     to do with the scatter in the bands, in output unit per m/s2.
     """
     ends = list(zip(edges_hz[:-1].tolist(), edges_hz[1:].tolist(), strict=True))
-    rows = [_Rows.of(windows, *end) for end in ends]
+    rows = [_BandRows.of(windows, *end) for end in ends]
     found = [own.solved() for own in rows]
     at_hz = np.array([own.frequency_hz for own in rows])
     left = at_the_middles(np.array([own for own, _ in found]), at_hz, np.sqrt(edges_hz[:-1] * edges_hz[1:]))
@@ -77,7 +77,7 @@ def _bands(windows: Sequence[_Moved], edges_hz: Array, taken: Complex, stated: A
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
+class _BandRows:
     """The slopes of all windows in one band: `rows` (R, 6) for the real and the imaginary parts of a row of S, `slopes`
     (R, 3) by output axis, `noise` (R, 3) of these; the mean frequency of the motion, NaN where there is none.
     `incoherent` (3,): the power of an axis that the reference does not explain, over what it explains."""
@@ -89,7 +89,7 @@ class _Rows:
     incoherent: Array
 
     @classmethod
-    def of(cls, windows: Sequence[_Moved], low_hz: float, high_hz: float) -> _Rows:
+    def of(cls, windows: Sequence[_Moved], low_hz: float, high_hz: float) -> _BandRows:
         """Those of the windows' bands whose middles are in this band."""
         parts, power, square = [(np.zeros((0, 6)), np.zeros((0, 3)), np.zeros((0, 3)))], 0.0, 0.0
         told, lost, at_hz = np.zeros(3), np.zeros(3), float(np.sqrt(low_hz * high_hz))

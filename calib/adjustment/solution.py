@@ -9,7 +9,7 @@ import numpy as np
 from calib.adjustment.equations import Equations
 from calib.estimate.chain import solved
 from calib.estimate.determined import Flags
-from calib.estimate.gauss_newton import Lines, gauss_newton
+from calib.estimate.gauss_newton import Linearised, gauss_newton
 from calib.estimate.nuisances import Priors
 from calib.estimate.reference_share import ReferenceShare
 from calib.model import Array
@@ -62,9 +62,9 @@ def solve(equations: Equations, priors: Priors) -> Solution:
     begin = mean.copy()
     begin[12:][[not term.kind.stated for term in equations.nuisances.terms]] = 0.0
 
-    def lines_at(x: Array) -> Lines:
+    def lines_at(x: Array) -> Linearised:
         residual, jacobian = equations.at(x[0]).stacked()
-        return Lines(np.column_stack([root, root @ (mean - x[0])]), [np.column_stack([jacobian, residual])])
+        return Linearised(np.column_stack([root, root @ (mean - x[0])]), [np.column_stack([jacobian, residual])])
 
     found = gauss_newton(lines_at, begin[None], floor=ROUNDING * scale)
     d, half = solved(found.root)

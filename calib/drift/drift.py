@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.drift.false_alarms import false_alarm_threshold
-from calib.drift.onsets import FEWEST, LEAST_THRESHOLD, SPAN, Change, Onsets
+from calib.drift.onsets import FEWEST, LEAST_THRESHOLD, SPAN, FittedChange, Onsets
 from calib.model import PARAMETERS, Array
 
 DAY_S = 86400.0
@@ -141,7 +141,7 @@ def _calmed(before: DriftVerdict, now: DriftVerdict) -> bool:
     return before.verdict != "stable" and now.verdict == "stable"
 
 
-def _stepped(base: DriftVerdict, step: Change, t_s: float) -> DriftVerdict:
+def _stepped(base: DriftVerdict, step: FittedChange, t_s: float) -> DriftVerdict:
     days = (t_s - step.onset_s) / DAY_S
     text = f"{base.parameter} stepped by {step.size:+.3g} (u {step.u_size:.2g}) {days:.1f} days ago"
     return replace(
@@ -154,7 +154,7 @@ def _stepped(base: DriftVerdict, step: Change, t_s: float) -> DriftVerdict:
     )
 
 
-def _drifting(base: DriftVerdict, ramp: Change, t_s: float) -> DriftVerdict:
+def _drifting(base: DriftVerdict, ramp: FittedChange, t_s: float) -> DriftVerdict:
     days = (t_s - ramp.onset_s) / DAY_S
     change, u_change = ramp.size * days, ramp.u_size * days
     text = (

@@ -31,7 +31,7 @@ _AGREED, _WINDOWS, _SQUARES, _MOVED, _MOVED_TIMES, _INFORMATION, _INFORMATION_TI
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class FittedChange:
     """The step or ramp that fits best.
 
     `size`, `u_size` in the unit of the parameter (per day for a ramp); `onset` is the number of the window with which
@@ -113,13 +113,13 @@ class Onsets:
         agreed, information = self._sums[_AGREED, :, series], self._sums[_INFORMATION, :, series]
         return np.where(counts, agreed**2, 0.0) / np.where(counts, 2.0 * information, 1.0)
 
-    def best_step(self, series: int) -> Change:
+    def best_step(self, series: int) -> FittedChange:
         """The step that fits best. Call it only if `strongest` is above 0."""
         onset, gain = self._best(series, _MOVED, _INFORMATION)
         sums = self._sums[:, onset, series]
         return self._change(series, onset, gain, sums[_MOVED] / sums[_INFORMATION], 1.0 / sums[_INFORMATION])
 
-    def best_ramp(self, series: int) -> Change:
+    def best_ramp(self, series: int) -> FittedChange:
         """The ramp that fits best; its size is per day. Call it only if `strongest` is above 0."""
         onset, gain = self._best(series, _MOVED_TIMES, _INFORMATION_SQUARES)
         moved, moved_times, i, i_times, i_squares = self._sums[_MOVED:, onset, series]
@@ -138,12 +138,12 @@ class Onsets:
         best = len(loud) - 1 - int(np.argmax(gains[::-1]))  # the youngest of equal ones: no information between them
         return int(loud[best]), float(gains[best])
 
-    def _change(self, series: int, onset: int, gain: float, size: float, variance: float) -> Change:
+    def _change(self, series: int, onset: int, gain: float, size: float, variance: float) -> FittedChange:
         squares, windows = self._sums[_SQUARES, onset, series], self._sums[_WINDOWS, onset, series]
         scatter = max(1.0, float((squares - 2.0 * gain) / (windows - 1.0)))
         start_s = float(self._starts_s[onset])
         u_size = float(np.sqrt(scatter * variance))
-        return Change(float(size), u_size, int(self._numbers[onset]), start_s, gain, scatter)
+        return FittedChange(float(size), u_size, int(self._numbers[onset]), start_s, gain, scatter)
 
     def snapshot(self) -> dict[str, Any]:
         """The complete state, for `load`; bit for bit."""

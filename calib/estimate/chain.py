@@ -29,7 +29,7 @@ class Passage:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Link:
+class EpochLink:
     """What was eliminated: own w + next d' = z, with own (J, J), next (J, N), z (J,), and the passage."""
 
     own: Array
@@ -43,7 +43,7 @@ def with_rows(root: Array, rows: Array) -> Array:
     return np.asarray(np.linalg.qr(np.vstack([root, rows]), mode="r"))[: root.shape[1] - 1]
 
 
-def passed(root: Array, passage: Passage, rows: Array | None = None) -> tuple[Array, Link]:
+def passed(root: Array, passage: Passage, rows: Array | None = None) -> tuple[Array, EpochLink]:
     """The triangle of the next epoch, with its own `rows` (r, N + 1) if there are any, and the link to it."""
     size, j = root.shape[1] - 1, passage.noise.shape[1]
     through = root[:, :size] @ passage.back
@@ -56,7 +56,7 @@ def passed(root: Array, passage: Passage, rows: Array | None = None) -> tuple[Ar
     if rows is not None:
         wide[j + size :, j:] = rows
     triangle = np.asarray(np.linalg.qr(wide, mode="r"))
-    link = Link(triangle[:j, :j], triangle[:j, j:-1], triangle[:j, -1], passage)
+    link = EpochLink(triangle[:j, :j], triangle[:j, j:-1], triangle[:j, -1], passage)
     return triangle[j : j + size, j:], link
 
 
@@ -66,17 +66,17 @@ def solved(root: Array) -> tuple[Array, Array]:
     return inverse @ root[:, -1], inverse
 
 
-def forward(root: Array, rows: Sequence[Array], passages: Sequence[Passage]) -> tuple[Array, list[Link]]:
+def forward(root: Array, rows: Sequence[Array], passages: Sequence[Passage]) -> tuple[Array, list[EpochLink]]:
     """All epochs. `root` (N, N + 1) is what is known before the first one, `rows` (r, N + 1) those of each epoch, and
     `passages` those from each one to the next."""
-    root, links = with_rows(root, rows[0]), list[Link]()
+    root, links = with_rows(root, rows[0]), list[EpochLink]()
     for own, passage in zip(rows[1:], passages, strict=True):
         root, link = passed(root, passage, own)
         links.append(link)
     return root, links
 
 
-def backward(root: Array, links: Sequence[Link]) -> Array:
+def backward(root: Array, links: Sequence[EpochLink]) -> Array:
     """(K, N) d of all epochs by all rows, from the last epoch back to the first."""
     last, _ = solved(root)
     d = np.zeros((len(links) + 1, len(last)))
@@ -89,7 +89,7 @@ def backward(root: Array, links: Sequence[Link]) -> Array:
     return d
 
 
-def returned(root: Array, link: Link) -> Array:
+def returned(root: Array, link: EpochLink) -> Array:
     """The triangle (J + N, J + N + 1) of [w, d] before a link by all rows, where `root` (N, N + 1) is that of the epoch
     after it by all rows. Its last N rows are what all rows say of the epoch before."""
     p, j = link.passage, len(link.z)
@@ -101,7 +101,7 @@ def returned(root: Array, link: Link) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def gains(links: Sequence[Link], last: Array) -> Iterator[tuple[Array, Array]]:
+def gains(links: Sequence[EpochLink], last: Array) -> Iterator[tuple[Array, Array]]:
     """Of each epoch, from the last one back to the first: covariances of d (N, m), and of the w of the passage to it
     (J, m), with m quantities; `last` (N, m) are those of d at the last epoch. No w comes before the first epoch."""
     for link in reversed(links):

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from calib.distributions import coverage_factor
-from calib.estimate.chain import Link, Passage, gains, passed, returned, solved
-from calib.estimate.gauss_newton import Lines, gauss_newton
+from calib.estimate.chain import EpochLink, Passage, gains, passed, returned, solved
+from calib.estimate.gauss_newton import Linearised, gauss_newton
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.physics import SIZE, STEP, Stack, Windows
 from calib.estimate.quantities import KINDS, LAG, PRIOR, RESPONSE, Quantity
-from calib.estimate.rows import Degrees, Noise, Rows
+from calib.estimate.rows import Degrees, NoiseScores, Rows
 from calib.estimate.statements import Statements
 from calib.estimate.unknowns import Unknown, Unknowns
 from calib.model import Array
@@ -44,7 +44,7 @@ class Now:
     """
 
     unknowns: Unknowns
-    noise: Noise
+    noise: NoiseScores
     seen_degc: Seen
     day: float
     x: Array
@@ -184,7 +184,7 @@ class Now:
         )
         low, high = state["seen_degc"]
         return cls(
-            Unknowns.loaded(statements, records, unknowns), Noise(**state["noise"]), (low, high), state["day"],
+            Unknowns.loaded(statements, records, unknowns), NoiseScores(**state["noise"]), (low, high), state["day"],
             np.array(state["x"]), np.array(state["around"]), np.array(state["root"]), state["chi2"],
         )  # fmt: skip
 
@@ -216,14 +216,14 @@ class Estimate:
 
     unknowns: Unknowns
     records: Sequence[Record]
-    noise: Sequence[Noise]
+    noise: Sequence[NoiseScores]
     seen_degc: Seen
     days: Array
     epoch_of: Index
     x: Array
     around: Array
     root: Array
-    links: Sequence[Link]
+    links: Sequence[EpochLink]
     rows: Sequence[Array]
     chi2: float
     passes: int
@@ -233,7 +233,7 @@ class Estimate:
         """What is known at the last epoch."""
         return Now(
             self.unknowns,
-            self.noise[-1] if self.noise else Noise(),
+            self.noise[-1] if self.noise else NoiseScores(),
             self.seen_degc,
             float(self.days[-1]),
             self.x[-1],
@@ -312,7 +312,7 @@ def estimate(
     with or without a window. `beside`: further records, which only tell how noisy those near them are.
     """
     every = sorted([(r.day, True, r) for r in records] + [(r.day, False, r) for r in beside], key=lambda each: each[0])
-    around = Noise.around([r for *_, r in every])
+    around = NoiseScores.around([r for *_, r in every])
     noise = [own for (_, counts, _), own in zip(every, around, strict=True) if counts]
     records = together(sorted(records, key=lambda r: r.day), fixed=statements.held_mps2 is not None)
     unknowns = Unknowns(statements, records)
@@ -321,7 +321,7 @@ def estimate(
     days = distinct(np.array([*(r.day for r in records), *stated, *also], dtype=np.float64))
     if not len(days):
         days = np.array([unknowns.begin])
-    solution = _Solution(unknowns, records, days, noise, _seen(records))
+    solution = _Passes(unknowns, records, days, noise, _seen(records))
     return solution.solved(start)
 
 
@@ -330,11 +330,11 @@ def _seen(records: Sequence[Record]) -> Seen:
     return (min(told), max(told)) if told else (np.nan, np.nan)
 
 
-class _Solution:
+class _Passes:
     """The passes of one estimate."""
 
     def __init__(
-        self, unknowns: Unknowns, records: Sequence[Record], days: Array, noise: Sequence[Noise], seen_degc: Seen
+        self, unknowns: Unknowns, records: Sequence[Record], days: Array, noise: Sequence[NoiseScores], seen_degc: Seen
     ) -> None:
         self.unknowns, self.records, self.days, self.noise, self.seen_degc = unknowns, records, days, noise, seen_degc
         self.epoch_of = np.searchsorted(days, [r.day for r in records])
@@ -386,7 +386,7 @@ class _Solution:
             x.append(follows @ x[-1] + shift)
         return np.array(x)
 
-    def lines_at(self, x: Array) -> Lines:
+    def lines_at(self, x: Array) -> Linearised:
         """All lines at x (K, N); the rows of each record are then in `by_record`."""
         if self.unsure:
             self._rows = self._made(x[-1])
@@ -405,7 +405,7 @@ class _Solution:
             replace(passage, gap=follows @ before + shift - after)
             for (follows, shift, passage), before, after in zip(self.passages, x, x[1:], strict=False)
         ]
-        return Lines(root, [np.vstack(parts) for parts in by_epoch], passages)
+        return Linearised(root, [np.vstack(parts) for parts in by_epoch], passages)
 
     def solved(self, start: Now | None) -> Estimate:
         """The estimate, from the passes of Gauss-Newton."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.estimate.chain import Link, Passage, backward, forward, solved
+from calib.estimate.chain import EpochLink, Passage, backward, forward, solved
 from calib.model import Array
 
 MOST_PASSES = 30
@@ -23,7 +23,7 @@ BESIDE = 1e-3  # of chi-squared by which it may be larger there; halved steps wo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lines:
+class Linearised:
     """All lines linearised at values x (K, N), acting on deviations from them: `root` (N, N + 1) of the priors, `rows`
     (r, N + 1) of each of K epochs, and the `passages` from each one to the next."""
 
@@ -38,26 +38,26 @@ class Lines:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class Minimum:
     """The values `x` (K, N) where the passes ended, with the `lines` there; `root` (N, N + 1) the triangle of the last
     epoch, `links` those between epochs; `chi2` the sum of squares of all lines."""
 
     x: Array
-    lines: Lines
+    lines: Linearised
     root: Array
-    links: Sequence[Link]
+    links: Sequence[EpochLink]
     chi2: float
     passes: int
 
 
 def gauss_newton(
-    lines_at: Callable[[Array], Lines],
+    lines_at: Callable[[Array], Linearised],
     x: Array,
     *,
     floor: Array | float = 0.0,
     follows: bool = True,
     alike: bool = True,
-) -> Found:
+) -> Minimum:
     """Passes from the values `x` (K, N) until no unknown moves by more than CONVERGED, or by more than `floor` (N,).
 
     `follows`: `x` goes from one epoch to the next as the passages say. `alike`: the weights of the lines do not depend
@@ -79,10 +79,10 @@ def gauss_newton(
         if (np.abs(back).max(axis=0) <= np.maximum(CONVERGED * np.linalg.norm(factor, axis=1), floor)).all():
             break
         x, walked = x + back, _squares(links, back)
-    return Found(x, lines, root, links, least, passes)
+    return Minimum(x, lines, root, links, least, passes)
 
 
-def _squares(links: Sequence[Link], back: Array) -> float:
+def _squares(links: Sequence[EpochLink], back: Array) -> float:
     """The sum of squares of what walks and steps have moved."""
     moved = (np.linalg.solve(link.own, link.z - link.next @ d) for link, d in zip(links, back[1:], strict=True))
     return float(sum(float(w @ w) for w in moved))

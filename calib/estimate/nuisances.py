@@ -20,7 +20,7 @@ from calib.estimate.quantities import (
     RESPONSE,
     SENSOR_CORNER,
     Kind,
-    Stated,
+    StatedValues,
     Statement,
 )
 from calib.model import Array, scale_of
@@ -36,7 +36,7 @@ ATTENUATED_U, MOST_ATTENUATED = 1e-3, 0.15
 
 
 @dataclass(frozen=True, init=False)
-class Priors(Stated):
+class Priors(StatedValues):
     """The priors: a standard uncertainty (GUM type B) for each nuisance, and for some of them a mean.
 
     Each number is an attribute; calib.estimate.quantities has the names, units and defaults. A standard uncertainty of

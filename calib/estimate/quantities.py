@@ -122,7 +122,7 @@ class Quantity:
 
 
 @dataclass(frozen=True, init=False)
-class Stated:
+class StatedValues:
     """Values for a table of statements; each value is an attribute with the name of its statement."""
 
     table: ClassVar[Mapping[str, Statement]] = {}

@@ -22,14 +22,14 @@ LEFT_U = 0.5  # standard uncertainties of ln h that may be left in the windows
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownResponses:
     """The filters that are known, and the sensor's `share` of the response that is left."""
 
     response: KnownResponse = UNKNOWN
     share: float = 1.0
 
     @classmethod
-    def of(cls, priors: Priors) -> Known:
+    def of(cls, priors: Priors) -> KnownResponses:
         """What the priors state."""
         return cls(priors.known, 1.0 - priors.reference_share)
 
@@ -39,7 +39,7 @@ class Known:
         return own.of_sensor(frequency_hz) / own.sensor_size(reference_hz) if own.sensor else 1.0
 
 
-NOTHING = Known()
+NOTHING = KnownResponses()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ def response_told(
     coverage_factor: float,
     per_octave: float = PER_OCTAVE,
     from_hz: float = 0.0,
-    known: Known = NOTHING,
+    known: KnownResponses = NOTHING,
 ) -> ResponseTold:
     """The response from S row by row and J unknowns of the response: `estimate` (9 + J,), `covariance` (9 + J, 9 + J).
 
@@ -123,7 +123,7 @@ def told_at_one_frequency(
     reference_hz: float,
     band_hz: tuple[float, float],
     coverage_factor: float,
-    known: Known = NOTHING,
+    known: KnownResponses = NOTHING,
 ) -> ResponseTold:
     """The same where all motion has one frequency, both ends of `band_hz`, and J = 1: the term in s^2 alone.
 
@@ -160,7 +160,7 @@ def _least_u(S: Array, covariance: Array) -> float:
 
 
 def _sensitivities(
-    estimate: Array, covariance: Array, effects: Array, frequency_hz: Array, reference_hz: float, known: Known
+    estimate: Array, covariance: Array, effects: Array, frequency_hz: Array, reference_hz: float, known: KnownResponses
 ) -> tuple[Complex, Array]:
     """Complex sensitivities (F, 3, 3) at F frequencies, the lag taken out, and their standard uncertainties."""
     S, z = estimate[:9], estimate[9:]

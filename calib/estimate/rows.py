@@ -32,7 +32,7 @@ HALF_WINDOWS = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class NoiseScores:
     """How much slopes and means of a window scatter, by it and those near it: `scores` (2, LEVELS, SUMS) of
     calib.windows.type_a, summed.
 
@@ -42,18 +42,18 @@ class Noise:
     scores: Array = field(default_factory=lambda: np.zeros((2, LEVELS, SUMS)))
 
     @classmethod
-    def around(cls, records: Sequence[Record]) -> list[Noise]:
+    def around(cls, records: Sequence[Record]) -> list[NoiseScores]:
         """That of each of the records, which are in the order of their days."""
         before, after = cls._one_way(records), cls._one_way(records[::-1])[::-1]
         return [cls(a.scores + b.scores - r.scores) for a, b, r in zip(before, after, records, strict=True)]
 
     @classmethod
-    def _one_way(cls, records: Sequence[Record]) -> list[Noise]:
+    def _one_way(cls, records: Sequence[Record]) -> list[NoiseScores]:
         return list(accumulate(records, cls.pooled, initial=cls()))[1:]
 
-    def pooled(self, record: Record) -> Noise:
+    def pooled(self, record: Record) -> NoiseScores:
         """That of the next record."""
-        return Noise(self.scores * 0.5 ** (record.windows / HALF_WINDOWS) + record.scores)
+        return NoiseScores(self.scores * 0.5 ** (record.windows / HALF_WINDOWS) + record.scores)
 
     @cached_property
     def _found(self) -> tuple[Scattered | None, Scattered | None]:
@@ -135,7 +135,7 @@ class Rows:
         unknowns: Unknowns,
         records: Sequence[Record],
         epoch_day: Array,
-        noise: Sequence[Noise],
+        noise: Sequence[NoiseScores],
         degrees: Degrees,
     ) -> None:
         s, by = unknowns.statements, dict[tuple[int, int, float, float, float, bool], list[int]]()
@@ -228,7 +228,12 @@ class _Slopes:
     """By what the slopes of W windows are multiplied, so that their covariance is one: `weights` (W, 6M, 6M)."""
 
     def __init__(
-        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Sequence[Noise], degrees: Degrees
+        self,
+        records: Sequence[Record],
+        windows: Windows,
+        unknowns: Unknowns,
+        noise: Sequence[NoiseScores],
+        degrees: Degrees,
     ) -> None:
         s, n, own = unknowns.statements, 6 * windows.channels, windows.stack
         merged, self._stretch = _merged(records)
@@ -290,7 +295,12 @@ class _Means:
     nobody stated gravity."""
 
     def __init__(
-        self, records: Sequence[Record], windows: Windows, unknowns: Unknowns, noise: Sequence[Noise], degrees: Degrees
+        self,
+        records: Sequence[Record],
+        windows: Windows,
+        unknowns: Unknowns,
+        noise: Sequence[NoiseScores],
+        degrees: Degrees,
     ) -> None:
         s, k = unknowns.statements, windows.stack.means.shape[1]
         merged, stretch = _merged(records)

@@ -20,7 +20,7 @@ from calib.estimate.quantities import (
     TILT_WALK,
     WALKS,
     Quantity,
-    Stated,
+    StatedValues,
     Statement,
     offset_temperature,
 )
@@ -28,7 +28,7 @@ from calib.model import Array
 
 
 @dataclass(frozen=True, init=False)
-class Wander(Stated):
+class Wander(StatedValues):
     """Standard deviations of random walks after one day; they grow with the square root of time.
 
     Each number is an attribute; calib.estimate.quantities has the names and defaults. `offset_rate_mps2` (per day) is

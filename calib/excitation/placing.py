@@ -39,7 +39,7 @@ class MeanOutput:
 
 
 @dataclass(frozen=True, slots=True)
-class Knowledge:
+class PlacingUncertainty:
     """Standard uncertainties of a stated angle (rad), of gravity (m/s2), and of the offset between windows (output
     unit)."""
 
@@ -80,7 +80,9 @@ def mean_output(indications: Array, rate_hz: float, shortest_s: float = SHORTEST
     return MeanOutput(value, leakage**2 * 2.0 * blocks.T @ blocks / len(blocks))
 
 
-def nearest_stop(mean: MeanOutput, stops: Sequence[Pose], calibration: Calibration, knowledge: Knowledge) -> Placed:
+def nearest_stop(
+    mean: MeanOutput, stops: Sequence[Pose], calibration: Calibration, knowledge: PlacingUncertainty
+) -> Placed:
     """The stop of `stops` at which V = S G + Q agrees with the mean, and decisively better than at any other stop.
 
     The pose is None if the mean agrees with no stop, or with two stops almost equally well.
@@ -106,7 +108,7 @@ def nearest_stop(mean: MeanOutput, stops: Sequence[Pose], calibration: Calibrati
 def clamp_angles(
     mean: MeanOutput,
     calibration: Calibration,
-    knowledge: Knowledge,
+    knowledge: PlacingUncertainty,
     gravity: tuple[float, int],
     theta_rad: float | None,
     position: str,
@@ -163,7 +165,9 @@ def _found(
     return Pose(position, pose.direction, pose.gravity_mps2, theta, alpha, WIDER * u_alpha, WIDER * u_theta)
 
 
-def _statistic(mean: MeanOutput, stop: Pose, calibration: Calibration, knowledge: Knowledge) -> tuple[float, float]:
+def _statistic(
+    mean: MeanOutput, stop: Pose, calibration: Calibration, knowledge: PlacingUncertainty
+) -> tuple[float, float]:
     """Chi-squared of the mean at a stop, and -2 ln of its likelihood (without the constant)."""
     S, G = calibration.sensitivity, stop.gravity_mps2
     size2 = float(G @ G)

@@ -13,7 +13,7 @@ import numpy as np
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.terms import Inputs, Nuisances
 from calib.model import Array, Calibration, Pose
-from calib.paper.propagation import Contribution, Response, Statement, propagate
+from calib.paper.propagation import Contribution, MethodUncertainty, Response, propagate
 from calib.paper.sine_fit import (
     ComplexArray,
     SineFit,
@@ -38,7 +38,7 @@ LEAST_CYCLES = 2  # each cycle gives one value, and an SD needs two
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class SineRun:
     """One run at one frequency in one position: n samples of reference and sensor at the same times `time_s` (n,).
 
     `reference` (n,) is in m/s2, or in m/s if `quantity` is "velocity"; `indications` (n, 3) are in output unit. `pose`
@@ -92,7 +92,7 @@ class AmplitudeCalibration:
     """
 
     calibration: Calibration
-    statement: Statement
+    statement: MethodUncertainty
     coverage_factor: float
     frequency_hz: float
     readings: tuple[Reading, ...]
@@ -110,7 +110,7 @@ class AmplitudeCalibration:
         return found
 
 
-def ratios(run: Run) -> Ratios:
+def ratios(run: SineRun) -> Ratios:
     """The ratios of a run: frequency by a four-parameter fit of the reference, amplitudes by three-parameter fits of
     each cycle. Where the run holds more than the sine, it is the longest part with whole cycles of one amplitude.
 
@@ -145,7 +145,7 @@ def ratios(run: Run) -> Ratios:
     )
 
 
-def _sine(run: Run) -> tuple[Run, SineFit]:
+def _sine(run: SineRun) -> tuple[SineRun, SineFit]:
     """The run, or its steady part if it holds more than the sine, and the sine of its reference."""
     with suppress(ValueError):
         whole = four_parameter(run.time_s, run.reference)
@@ -159,7 +159,7 @@ def _distortion(reference: SineFit) -> float:
     return float(reference.residual_sd[0] / reference.amplitude[0])
 
 
-def _steady(run: Run, frequency_hz: float) -> Run:
+def _steady(run: SineRun, frequency_hz: float) -> SineRun:
     """The longest part of a run in which the cycles of the reference have one amplitude; the run itself if no part has
     enough cycles."""
     edges = cycle_edges(run.time_s, frequency_hz)
@@ -215,7 +215,7 @@ def combine(
     u_frequency = float(np.max([r.u_frequency_hz / r.frequency_hz for r in found]))
     contributions[f"frequency, method {method}"] = Contribution("frequency", -u_frequency * _padded(S))  # Eq. (12)
     contributions |= unseen or {}
-    statement = Statement(contributions, _padded(u_a), _padded(freedom))
+    statement = MethodUncertainty(contributions, _padded(u_a), _padded(freedom))
     determined = np.sqrt(np.diag(statement.covariance)) <= DETERMINED_U * np.nanmax(np.abs(np.diag(S)))
     values = np.where(determined, _padded(S), np.nan)
     calibration = Calibration(

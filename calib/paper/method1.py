@@ -8,12 +8,12 @@ import numpy as np
 
 from calib.estimate.nuisances import Priors
 from calib.model import Pose
-from calib.paper.amplitudes import AmplitudeCalibration, Run, combine, ratios, read
+from calib.paper.amplitudes import AmplitudeCalibration, SineRun, combine, ratios, read
 
 ON_AXIS = 1 - 1e-6  # cosine of 0.08 deg, smaller than the uncertainty of any mounting
 
 
-def solve(runs: Sequence[Run], priors: Priors | None = None) -> AmplitudeCalibration:
+def solve(runs: Sequence[SineRun], priors: Priors | None = None) -> AmplitudeCalibration:
     """A column of S for each axis that was along the motion: the mean over its runs and their cycles.
 
     Main sensitivities by Eq. (2), S_jj = V_j / a_j; transverse ones by Eqs. (1), (3) and (4), S_ij = V_i / a_j. Their

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.estimate.nuisances import Priors
 from calib.model import Array
-from calib.paper.amplitudes import AmplitudeCalibration, Ratios, Run, combine, ratios, read
+from calib.paper.amplitudes import AmplitudeCalibration, Ratios, SineRun, combine, ratios, read
 from calib.paper.propagation import Contribution
 from calib.paper.statistics import AXES, TRANSVERSE_LIMIT_PCT
 
@@ -18,7 +18,7 @@ LEAST_SHARE = 0.2
 
 
 def solve(
-    runs: Sequence[Run], priors: Priors | None = None, transverse_limit_pct: float = TRANSVERSE_LIMIT_PCT
+    runs: Sequence[SineRun], priors: Priors | None = None, transverse_limit_pct: float = TRANSVERSE_LIMIT_PCT
 ) -> AmplitudeCalibration:
     """S_xx, S_yy, S_zz in output unit per m/s2: Eq. (2) with the reference accelerations of Eqs. (5)-(7).
 

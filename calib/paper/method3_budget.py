@@ -14,11 +14,11 @@ from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.terms import Inputs, Nuisances
 from calib.model import Array, Pose, Window
 from calib.paper.method3 import Fit
-from calib.paper.propagation import Contribution, Statement, propagate
+from calib.paper.propagation import Contribution, MethodUncertainty, propagate
 from calib.windows.sums import pool
 
 
-def statement(fit: Fit, windows: Sequence[Window], priors: Priors) -> Statement:
+def statement(fit: Fit, windows: Sequence[Window], priors: Priors) -> MethodUncertainty:
     """Contributions of all nuisances to `fit`, the plain solution of the used windows; type A for white residuals.
 
     Raises ValueError if the windows do not determine all of S, because the effect of an unknown element is not known.
@@ -31,7 +31,9 @@ def statement(fit: Fit, windows: Sequence[Window], priors: Priors) -> Statement:
     )
     contributions |= _offsets_between_windows(model, priors.offset_mps2)
     calibration = fit.calibration
-    return Statement(contributions, calibration.standard_uncertainty, np.full(12, calibration.degrees_of_freedom))
+    return MethodUncertainty(
+        contributions, calibration.standard_uncertainty, np.full(12, calibration.degrees_of_freedom)
+    )
 
 
 class _Model:

@@ -29,7 +29,7 @@ class Contribution:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Statement:
+class MethodUncertainty:
     """The uncertainty of the result of one method: type B contributions by nuisance, and the type A part.
 
     `u_type_a` (12,) and its degrees of freedom `freedom_type_a` (12,); NaN for parameters the method does not give.
@@ -78,7 +78,7 @@ def propagate(response: Response, nuisances: Nuisances) -> dict[str, Contributio
     return found
 
 
-def joint_covariance(statements: Sequence[Statement]) -> Array:
+def joint_covariance(statements: Sequence[MethodUncertainty]) -> Array:
     """(12 M, 12 M) joint covariance of the results of M methods; common errors cancel in their differences.
 
     Nuisances with the same name are one quantity (one reference, one clamp, one mounting); the name has the position.

@@ -48,7 +48,7 @@ UNLIKELY = 3.0
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 
 
-class _Told(NamedTuple):
+class _AdjustedOutcome(NamedTuple):
     """An outcome and the adjustment that it tells; None where no window can be used. `narrower`: where it is refused
     because of the response over frequency, the bands that are tried next; empty elsewhere."""
 
@@ -91,7 +91,7 @@ def adjusted(
     return replace(outcome, more={**outcome.more, "shared_errors": [share.told(*identity)]})
 
 
-def _in_the_widest(tables: Tables, priors: Priors) -> tuple[_Told, Band | None]:
+def _in_the_widest(tables: Tables, priors: Priors) -> tuple[_AdjustedOutcome, Band | None]:
     """What is told in the widest band that is not refused, and this band; None where nothing was limited."""
     whole = _adjusted(tables, priors)
     for tried, band_hz in enumerate(whole.narrower, 2):
@@ -148,7 +148,7 @@ def _not_alike(found: Adjustment) -> str:
     )
 
 
-def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN_BANDS) -> _Told:
+def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN_BANDS) -> _AdjustedOutcome:
     """Make windows with the lag and the response over frequency taken out, and adjust them. Bands may deviate from one
     response by `most_between`."""
     search = _Search(tables, priors, most_between)
@@ -167,17 +167,19 @@ def _adjusted(tables: Tables, priors: Priors, most_between: float = MOST_BETWEEN
         applied = told
     if refused is not None and not _used(search.windows):
         narrower = search.of_any_response(applied.lag_s)
-        return _Told(nothing_used(refused, tables.rate_hz, METHOD), None, narrower)
+        return _AdjustedOutcome(nothing_used(refused, tables.rate_hz, METHOD), None, narrower)
     more = {} if first is None else _response(search.by_band(*first))
-    return _Told(Outcome(None, (UNSETTLED,), search.windows, tables.rate_hz, METHOD, more=more), None, search.narrower)
+    return _AdjustedOutcome(
+        Outcome(None, (UNSETTLED,), search.windows, tables.rate_hz, METHOD, more=more), None, search.narrower
+    )
 
 
-def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_hz: float) -> _Told | Applied:
+def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_hz: float) -> _AdjustedOutcome | Applied:
     """The outcome, or what must still be taken out of the windows."""
     windows, found = search.windows, search.at(search.windows, applied)
     if not search.stated.response:
         found = _attenuated(found, windows, priors, applied)
-        return _Told(_outcome(found, windows, rate_hz), found)
+        return _AdjustedOutcome(_outcome(found, windows, rate_hz), found)
     told = found.response
     left_u = LEFT_U if turn <= HOPELESS else 2.0 * LEFT_U  # noisy windows change a little with the response, to and fro
     if not (told is None or told.is_taken_out(applied.response, left_u) or (turn >= HOPELESS and found.reasons)):
@@ -187,7 +189,7 @@ def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_h
     if outcome.calibration is None:
         outcome = replace(outcome, more={**outcome.more, **_response(search.by_band(found, applied.lag_s))})
     narrower = search.narrower if deviates and outcome.reasons == tuple(deviates) else ()
-    return _Told(outcome, found, narrower)
+    return _AdjustedOutcome(outcome, found, narrower)
 
 
 class _Search:
@@ -310,7 +312,7 @@ def _attenuated(found: Adjustment, windows: Sequence[Window], priors: Priors, ap
     return adjust(_used(windows), known, applied) if known.response else found
 
 
-def _at_rest(told: _Told, priors: Priors) -> tuple[Outcome, Adjustment | None]:
+def _at_rest(told: _AdjustedOutcome, priors: Priors) -> tuple[Outcome, Adjustment | None]:
     """The outcome and its adjustment: those of the rests alone, with S at 0 Hz, where they tell S about as well as all
     windows do at the frequency of the motion, or contradict the motion, and nobody stated a frequency.
 

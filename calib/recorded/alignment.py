@@ -26,7 +26,7 @@ LEAST_RATE = 1e-6  # clocks fitted to stamps of one gateway differ by 0.2 ppm, t
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class LagDrift:
     """Lag over time: `lag_s` at `time_s`; it changes by `rate` (s/s), whose standard uncertainty is `u_rate`."""
 
     time_s: float
@@ -40,7 +40,7 @@ class Drift:
         return abs(self.rate) > max(SIGNIFICANT * self.u_rate, LEAST_RATE)
 
 
-def drift(windows: Sequence[Window]) -> Drift | None:
+def drift(windows: Sequence[Window]) -> LagDrift | None:
     """The straight line through the lags of all segments of the used windows of kind "motion".
 
     None if there are fewer than LEAST_SEGMENTS.
@@ -63,7 +63,7 @@ def drift(windows: Sequence[Window]) -> Drift | None:
     inverse = np.linalg.pinv(products[:2, :2], hermitian=True)
     line = inverse @ products[:2, 2]
     scatter = float(products[2, 2] - line @ products[:2, 2]) / (len(lag_s) - 2)
-    return Drift(middle, float(line[0]), float(line[1]), float(np.sqrt(inverse[1, 1] * max(scatter, 1.0))))
+    return LagDrift(middle, float(line[0]), float(line[1]), float(np.sqrt(inverse[1, 1] * max(scatter, 1.0))))
 
 
 def u_lag_s(window: Window) -> float:

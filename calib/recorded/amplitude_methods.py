@@ -9,7 +9,7 @@ import numpy as np
 from calib.estimate.axes import sensitivity_reasons
 from calib.model import PARAMETERS
 from calib.paper import method1, method2
-from calib.paper.amplitudes import AmplitudeCalibration, Run
+from calib.paper.amplitudes import AmplitudeCalibration, SineRun
 from calib.paper.statistics import rel_s_pct, transverse_excess
 from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
@@ -34,7 +34,7 @@ def by_amplitudes(tables: Tables, options: Options) -> Outcome:
         raise OptionError(
             f"`method` {method} needs a uniaxial `reference`, but this one is tri-axial", "use `method` 3"
         )
-    runs = [Run(p.time_s, p.u[:, 0], p.V, w.pose) for p, w in pairs if w.used]
+    runs = [SineRun(p.time_s, p.u[:, 0], p.V, w.pose) for p, w in pairs if w.used]
     if not runs:
         return nothing_used(windows, tables.rate_hz, str(method))
     try:

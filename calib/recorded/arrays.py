@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.model import Array
 from calib.output_unit import common
-from calib.recorded.choice import Choice, Chosen, Column
+from calib.recorded.choice import Choice, ChosenColumn, Column
 from calib.recorded.columns import reference_columns, sensor_columns, si_of
 from calib.recorded.errors import InputError
 from calib.recorded.poses import AXIS, SPAN, PoseRow, Poses, columns_of
@@ -160,7 +160,7 @@ def _column(columns: Mapping[Any, Any], name: str, place: str) -> Any:
     return columns[name]
 
 
-def _chosen_rows(columns: Mapping[Any, Any], chosen: Sequence[Chosen], scale: Array, place: str) -> Array:
+def _chosen_rows(columns: Mapping[Any, Any], chosen: Sequence[ChosenColumn], scale: Array, place: str) -> Array:
     """The chosen columns as rows (n, k), checked: times in s, the others times `scale` (k - 1)."""
     time = unit_of(chosen[0].unit) if chosen[0].unit else None
     if time is not None and time.quantity != "time":

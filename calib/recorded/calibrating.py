@@ -19,7 +19,7 @@ from calib.recorded.causes import causes, silent_channels
 from calib.recorded.errors import InputError, OptionError
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome, nothing_used
-from calib.recorded.poses import PoseInterval, Poses, Setting, beside_reference, intervals_of
+from calib.recorded.poses import PoseInterval, Poses, PoseSettings, beside_reference, intervals_of
 from calib.recorded.priors import contradictions, instrument_of, priors_of
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.recorded.tables import Making, Tables
@@ -96,10 +96,10 @@ def _check_quantity(reference: ReferenceTable, stated: str | None) -> None:
         )  # fmt: skip
 
 
-def _setting(options: Options, reference: ReferenceTable | None) -> Setting:
+def _setting(options: Options, reference: ReferenceTable | None) -> PoseSettings:
     """The settings that apply to every pose."""
     channels = 0 if reference is None else reference.channels
-    return Setting(
+    return PoseSettings(
         gravity_mps2=options.gravity or STANDARD_GRAVITY_MPS2,
         static_sign=options.static_sign,
         coupling=options.coupling,
@@ -109,7 +109,7 @@ def _setting(options: Options, reference: ReferenceTable | None) -> Setting:
     )
 
 
-def _intervals(poses: Poses | None, setting: Setting, reference: ReferenceTable | None) -> list[PoseInterval]:
+def _intervals(poses: Poses | None, setting: PoseSettings, reference: ReferenceTable | None) -> list[PoseInterval]:
     if setting.rotation is not None and setting.reference_channels != 3:
         raise OptionError("`rotation` is for a tri-axial `reference`, but this one has one axis", "remove `rotation`")
     if poses is not None:

@@ -45,7 +45,7 @@ class Column:
         return f"{self.group}.{self.name}" if self.group else self.name
 
 
-class Named(Protocol):
+class NamedColumns(Protocol):
     """What has named columns: a file, or a table in memory. `header`: where it names them, for messages."""
 
     path: Any
@@ -54,7 +54,7 @@ class Named(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class ChosenColumn:
     """A column and its unit in lower case, "" where none is stated."""
 
     column: Column
@@ -70,7 +70,7 @@ class Choice:
     column, with ":UNIT" if the file does not state the unit.
     """
 
-    def __init__(self, source: Named, stated: str | None = None, option: str = "") -> None:
+    def __init__(self, source: NamedColumns, stated: str | None = None, option: str = "") -> None:
         self._source, self._option = source, option
         self._stated = self._read(stated)
         group = self._stated.pop("group", None)
@@ -141,7 +141,7 @@ class Choice:
         """Whether columns are stated."""
         return bool(self._stated)
 
-    def stated(self, word: str) -> Chosen | None:
+    def stated(self, word: str) -> ChosenColumn | None:
         """The column that is stated for `word`, None where none is."""
         name = self._stated.get(word)
         if name is None:
@@ -154,10 +154,10 @@ class Choice:
             if found and unit and unit_of(unit) is None:
                 raise self.fault(f"unit {unit!r} of column {candidate!r} is not known; known are {', '.join(UNITS)}")
             if found:
-                return Chosen(found[0], unit or _unit(found[0]))
+                return ChosenColumn(found[0], unit or _unit(found[0]))
         raise self.fault(f"there is no column {name!r}")
 
-    def standard(self, names: Iterable[str]) -> list[Chosen] | None:
+    def standard(self, names: Iterable[str]) -> list[ChosenColumn] | None:
         """The columns that have exactly these names, in the units of these names. None where one is missing.
 
         Raises InputError where one of them is also there in another unit.
@@ -173,33 +173,33 @@ class Choice:
                 raise self.fault(f"there are both {name} and {others[0]}")
             if same[0].unit and name == "time_s" and unit_of(same[0].unit) != unit_of("s"):
                 raise self.fault(f"column {name} is in {same[0].unit!r}")
-            found.append(Chosen(same[0], "s" if name == "time_s" else _unit(same[0])))
+            found.append(ChosenColumn(same[0], "s" if name == "time_s" else _unit(same[0])))
         return found
 
-    def guessed(self, role: str) -> Chosen | None:
+    def guessed(self, role: str) -> ChosenColumn | None:
         """The only column whose name tells that it is `role`: time, x, y, z, temperature. None where none does."""
         found = [c for c in self._columns if _role(c) == role]
         if len(found) > 1:
             raise self.fault(f"several columns could be {role}: {', '.join(repr(str(c)) for c in found)}")
-        return Chosen(found[0], _unit(found[0])) if found else None
+        return ChosenColumn(found[0], _unit(found[0])) if found else None
 
-    def rest(self, taken: Sequence[Chosen]) -> list[Chosen]:
+    def rest(self, taken: Sequence[ChosenColumn]) -> list[ChosenColumn]:
         """The columns that are not taken and that are neither times nor temperatures."""
         columns = [t.column for t in taken]
         group = {c.group for c in columns}
         return [
-            Chosen(c, _unit(c)) for c in self._columns
+            ChosenColumn(c, _unit(c)) for c in self._columns
             if c not in columns and _role(c) not in ("time", "temperature") and (not group or c.group in group)
         ]  # fmt: skip
 
-    def say(self, found: Mapping[str, Chosen]) -> None:
+    def say(self, found: Mapping[str, ChosenColumn]) -> None:
         """Keep for the user what was guessed."""
         told = ", ".join(f"{word}={c.column}{f' in {c.unit}' if c.unit else ''}" for word, c in found.items())
         other = f"state others with {self._option}" if self._option else "rename them where others are meant"
         self.said.append(f"{self._source.path}: columns guessed: {told}; {other}")
 
 
-def quantity_of(chosen: Chosen) -> str | None:
+def quantity_of(chosen: ChosenColumn) -> str | None:
     """The quantity of a column by its unit, or by its name. None where neither tells."""
     unit = unit_of(chosen.unit) if chosen.unit else None
     if unit is not None and unit.quantity in QUANTITY_WORDS:

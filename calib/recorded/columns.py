@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib.recorded.choice import AXES, Choice, Chosen, quantity_of
+from calib.recorded.choice import AXES, Choice, ChosenColumn, quantity_of
 from calib.recorded.table import REFERENCES, SENSOR
 from calib.recorded.units import Sensitivity, unit_of
 
@@ -11,7 +11,7 @@ ELECTRICAL = ("indication", "count")
 QUANTITIES = {"a": "acceleration", "v": "velocity", "d": "displacement"}  # by the letter with which they are stated
 
 
-def sensor_columns(choice: Choice) -> list[Chosen]:
+def sensor_columns(choice: Choice) -> list[ChosenColumn]:
     """Columns of time, x, y, z and, where there is one, temperature. Raises InputError."""
     if not choice.is_stated and (found := choice.standard(SENSOR)):
         return [*found, *(choice.standard([TEMPERATURE]) or [])]
@@ -28,13 +28,13 @@ def sensor_columns(choice: Choice) -> list[Chosen]:
     return list(known.values())
 
 
-def _by_role(choice: Choice) -> dict[str, Chosen]:
+def _by_role(choice: Choice) -> dict[str, ChosenColumn]:
     """The columns that are stated, or that their names tell."""
     roles = {role: choice.stated(role) or choice.guessed(role) for role in ("time", *AXES)}
     return {role: column for role, column in roles.items() if column}
 
 
-def _with_unnamed(choice: Choice, known: dict[str, Chosen]) -> dict[str, Chosen]:
+def _with_unnamed(choice: Choice, known: dict[str, ChosenColumn]) -> dict[str, ChosenColumn]:
     """The same with the columns beside the time, or with all, where only their order tells what they are."""
     rest = choice.rest(list(known.values()))
     if list(known) == ["time"] and len(rest) == len(AXES):
@@ -44,7 +44,7 @@ def _with_unnamed(choice: Choice, known: dict[str, Chosen]) -> dict[str, Chosen]
     return known
 
 
-def reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[Chosen], str]:
+def reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[ChosenColumn], str]:
     """Columns of time and of one or three channels, and their quantity. Raises InputError."""
     if not choice.is_stated and (standard := _standard_reference(choice)):
         columns, quantity = standard
@@ -61,7 +61,7 @@ def reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[
     return [time, *channels], told or "acceleration"
 
 
-def _standard_reference(choice: Choice) -> tuple[list[Chosen], str] | None:
+def _standard_reference(choice: Choice) -> tuple[list[ChosenColumn], str] | None:
     """The columns of a reference with this program's names, and their quantity; None where there are none."""
     found = {names: choice.standard(("time_s", *names)) for names in REFERENCES}
     there = [(names, columns) for names, columns in found.items() if columns]
@@ -70,7 +70,7 @@ def _standard_reference(choice: Choice) -> tuple[list[Chosen], str] | None:
     return (there[0][1], REFERENCES[there[0][0]]) if there else None
 
 
-def _channels(choice: Choice, time: Chosen | None) -> tuple[str | None, list[Chosen]]:
+def _channels(choice: Choice, time: ChosenColumn | None) -> tuple[str | None, list[ChosenColumn]]:
     """The quantity that is stated with one channel, and the channels: one, three, or any other number if they are not
     to be told."""
     one = [(quantity, column) for letter, quantity in QUANTITIES.items() if (column := choice.stated(letter))]
@@ -81,12 +81,12 @@ def _channels(choice: Choice, time: Chosen | None) -> tuple[str | None, list[Cho
     return None, three or (choice.rest([time]) if time else [])
 
 
-def _is_electrical(chosen: Chosen) -> bool:
+def _is_electrical(chosen: ChosenColumn) -> bool:
     unit = unit_of(chosen.unit) if chosen.unit else None
     return unit is not None and unit.quantity in ELECTRICAL
 
 
-def si_of(choice: Choice, chosen: Chosen, sensitivity: Sensitivity | None) -> float:
+def si_of(choice: Choice, chosen: ChosenColumn, sensitivity: Sensitivity | None) -> float:
     """What one unit of the column is in SI units. Raises InputError."""
     unit = unit_of(chosen.unit) if chosen.unit else None
     if sensitivity is None:

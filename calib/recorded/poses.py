@@ -34,7 +34,7 @@ class PoseRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class PoseSettings:
     """Settings for every pose: gravity, the static sign of Eqs. (9)-(11), the couplings, and the rotation.
 
     `rotation` (3, 3) is for a tri-axial reference beside the sensor: a = R a_ref.
@@ -97,7 +97,7 @@ class Poses:
         return InputError(problem, "correct the times", place=self.place, row=row, column=column, value=value)
 
 
-def intervals_of(poses: Poses, setting: Setting) -> list[PoseInterval]:
+def intervals_of(poses: Poses, setting: PoseSettings) -> list[PoseInterval]:
     """The poses in this setting. Raises InputError."""
     intervals = []
     for k, row in enumerate(poses.rows):
@@ -108,7 +108,7 @@ def intervals_of(poses: Poses, setting: Setting) -> list[PoseInterval]:
     return intervals
 
 
-def pose_of(row: PoseRow, setting: Setting) -> Pose:
+def pose_of(row: PoseRow, setting: PoseSettings) -> Pose:
     """One row as a pose. Raises ValueError if the row does not suit the setting."""
     stated = [row.values[name] for name in GRAVITY] if GRAVITY[0] in row.values else None
     gravity = _felt(stated, setting)
@@ -136,7 +136,7 @@ def pose_of(row: PoseRow, setting: Setting) -> Pose:
     return _without_what_the_reference_feels(pose) if setting.reference_coupling == "dc" else pose
 
 
-def beside_reference(setting: Setting, gravity: Sequence[float] | None = None) -> Pose:
+def beside_reference(setting: PoseSettings, gravity: Sequence[float] | None = None) -> Pose:
     """The pose beside a tri-axial reference; `gravity` as its row states it, None if it is not stated there."""
     if setting.rotation is None:
         raise ValueError("a tri-axial reference needs `rotation`, its orientation against the sensor")
@@ -147,7 +147,7 @@ def beside_reference(setting: Setting, gravity: Sequence[float] | None = None) -
     return beside(setting.rotation, _felt(gravity, setting))
 
 
-def _felt(stated: Sequence[float] | None, setting: Setting) -> Sequence[float] | None:
+def _felt(stated: Sequence[float] | None, setting: PoseSettings) -> Sequence[float] | None:
     """Gravity that the sensor measures. Raises ValueError if its length is wrong, for example in g or in cm/s2."""
     if setting.coupling == "ac":
         return NOT_FELT
@@ -160,7 +160,7 @@ def _felt(stated: Sequence[float] | None, setting: Setting) -> Sequence[float] |
     return stated
 
 
-def _at_rest(gravity: Sequence[float] | None, setting: Setting) -> Pose:
+def _at_rest(gravity: Sequence[float] | None, setting: PoseSettings) -> Pose:
     assert gravity is not None
     if setting.coupling == "ac":
         raise ValueError(

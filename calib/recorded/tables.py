@@ -22,7 +22,7 @@ from calib.excitation.front_end import (
 from calib.excitation.pieces import pieces_of
 from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
-from calib.recorded.alignment import Drift, drift
+from calib.recorded.alignment import LagDrift, drift
 from calib.recorded.errors import InputError
 from calib.recorded.poses import PoseInterval
 from calib.recorded.segments import segments_joined, with_joined
@@ -69,7 +69,9 @@ class Tables:
         self._sensor = TableStream(sensor.name, sensor.time_s, sensor.v)
         self._reference = None if reference is None else TableStream(reference.name, reference.time_s, reference.x)
         self._instrument = instrument
-        self.drift: Drift | None = None  # of the sensor's clock against the reference's; None until windows were made
+        self.drift: LagDrift | None = (
+            None  # of the sensor's clock against the reference's; None until windows were made
+        )
         self.poses = poses
         first_s, end_s = self._sensor.span_s
         length_s = sum(max(min(p.stop_s, end_s) - max(p.start_s, first_s), 0.0) for p in poses)

@@ -39,7 +39,7 @@ _WAYS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class UncertaintySource:
     """A source of the uncertainty: its part of U of each parameter of `parameters_of`, and what makes it smaller."""
 
     name: str
@@ -99,7 +99,7 @@ def parameters_of(result: MeasurementResult) -> list[int]:
     return [max(group, key=lambda k: float(compared[k])) for group in told if group]
 
 
-def largest_sources(result: MeasurementResult) -> list[Source]:
+def largest_sources(result: MeasurementResult) -> list[UncertaintySource]:
     """The sources with the largest shares in the variances of `parameters_of`, the largest first; three at most."""
     chosen = parameters_of(result)
     variances = result.standard_uncertainty[chosen] ** 2
@@ -107,7 +107,7 @@ def largest_sources(result: MeasurementResult) -> list[Source]:
     parts = {name: np.array([_of(part, k) for k in chosen]) for name, part in result.more.get("budget", {}).items()}
     shares = {name: float(np.max(u**2 / variances)) for name, u in parts.items() if u.size}
     largest = sorted(shares, key=lambda name: -shares[name])[:MOST_SOURCES]
-    return [Source(name, tuple((factors * parts[name]).tolist()), way_of(name)) for name in largest]
+    return [UncertaintySource(name, tuple((factors * parts[name]).tolist()), way_of(name)) for name in largest]
 
 
 def way_of(source: str) -> str:

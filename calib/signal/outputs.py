@@ -42,7 +42,7 @@ LEAST_BURST, LEAST_CHANGES = 8, 8  # of a burst that is compared with the one be
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class StuckOutput:
     """An output that is held at `low`, or toggles between `low` and `high`, since sample number `first`."""
 
     axis: int
@@ -124,7 +124,7 @@ class Outputs:
         covariance = np.atleast_2d(np.cov(self._slow.T))
         return np.asarray(covariance - 25.0 * np.diag(noise))
 
-    def held(self, expected: Array) -> list[Held]:
+    def held(self, expected: Array) -> list[StuckOutput]:
         """The outputs that a sound device could not have held. `expected` (A,): rms of the motion along each output in
         the last MOVED_S as another device tells it, in output unit; 0 where none does."""
         length, fine = self._taken - self._same[0], self._quietest >= FINE * self.step
@@ -139,13 +139,13 @@ class Outputs:
             never = self._same[0, k] == self._begun and length[k] >= NEVER and held_s[k] >= NEVER_S
             never &= others.any() and bool((self._quietest[others] >= 2.0 * FINE * self.step).all())
             if own or never:
-                found.append(Held(k, int(self._same[1, k]), float(self._last[k]), float(self._last[k])))
+                found.append(StuckOutput(k, int(self._same[1, k]), float(self._last[k]), float(self._last[k])))
             elif np.isfinite(self.step) and near[k] / self._rate_hz >= MOVED_S and expected[k] >= MOVED * self.step:
-                found.append(Held(k, int(self._near[1, k]), *self._ends[:, k].tolist()))
+                found.append(StuckOutput(k, int(self._near[1, k]), *self._ends[:, k].tolist()))
         self._stuck[[held.axis for held in found]] = True
         return found
 
-    def goes_on(self, held: Held) -> bool:
+    def goes_on(self, held: StuckOutput) -> bool:
         """Whether an output has not changed since it was found to be held."""
         since = self._same if held.low == held.high else self._near
         return bool(since[1, held.axis] <= held.first)

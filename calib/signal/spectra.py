@@ -30,7 +30,7 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx, yy, zz, xy, xz, 
 
 
 @dataclass(frozen=True, slots=True)
-class Scatter:
+class NoiseScatter:
     """How a sum of lines of white noise scatters from segment to segment: its relative standard deviation `u`, and the
     `shape` of the gamma distribution that has the same skewness."""
 
@@ -65,9 +65,9 @@ class Bands:
     samples: int
     centre_hz: Array
     edges_hz: Array
-    scatter: tuple[Scatter, ...]
+    scatter: tuple[NoiseScatter, ...]
     groups: tuple[int, ...]
-    group_scatter: Scatter
+    group_scatter: NoiseScatter
 
     @property
     def line_hz(self) -> float:
@@ -179,7 +179,7 @@ def _weights(low: float, high: float) -> Array:
     return np.asarray(np.minimum(k + 0.5, high) - np.maximum(k - 0.5, low))
 
 
-def _scatter(weights: Array) -> Scatter:
+def _scatter(weights: Array) -> NoiseScatter:
     """Of a weighted sum of neighbouring lines of white noise: a sum of exponential variables, whose scales are the
     eigenvalues of their covariance."""
     times = len(weights) / MANY_LINES if len(weights) > MANY_LINES else 1.0
@@ -188,4 +188,4 @@ def _scatter(weights: Array) -> Scatter:
     correlation = np.array([*HANN, 0.0])[np.minimum(apart, len(HANN))]
     scales = np.linalg.eigvalsh(root[:, None] * correlation * root)
     first, second, third = (float(np.sum(scales**power)) for power in (1, 2, 3))
-    return Scatter(math.sqrt(second / times) / first, times * second**3 / third**2)
+    return NoiseScatter(math.sqrt(second / times) / first, times * second**3 / third**2)

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.model import PARAMETERS, Array
-from calib.site_adjustment.device import Device
-from calib.site_adjustment.site import Message, Site
+from calib.site_adjustment.device import SiteDevice
+from calib.site_adjustment.site import EliminatedRows, Site
 
 FALSE_ALARM = 0.05  # probability that a device of a sound site is named
 OF_REFERENCES = 0.8  # part of it that the references get: the error of a reference is in all the sensors that it met
@@ -32,7 +32,7 @@ FIXED = 1e-9  # relative singular value: below, an error in one axis does not sh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+class DeviceVerdict:
     """One device against all others.
 
     `axis` of a reference in which the error is supposed; "" for all axes, and for a sensor. `statistic` is chi-squared
@@ -50,17 +50,17 @@ class Verdict:
     bias: Array
 
 
-def verdicts(site: Site) -> list[Verdict]:
+def verdicts(site: Site) -> list[DeviceVerdict]:
     """All devices that can be tested, each by the test that speaks most against it, the most contradictory first."""
-    first: dict[str, Verdict] = {}
+    first: dict[str, DeviceVerdict] = {}
     for verdict in sorted(alternatives(site), key=lambda v: (v.probability, -v.statistic)):
         first.setdefault(verdict.device, verdict)
     return [replace(v, probability=min(v.probability, 1.0)) for v in first.values()]
 
 
-def alternatives(site: Site) -> list[Verdict]:
+def alternatives(site: Site) -> list[DeviceVerdict]:
     """All tests of all devices. A `probability` above 1 is that of a test that says nothing among so many."""
-    of: dict[str, list[Message]] = {name: [] for name in site.core}
+    of: dict[str, list[EliminatedRows]] = {name: [] for name in site.core}
     for message in site.messages():
         for name in site.core_of(message):
             of[name].append(message)
@@ -71,7 +71,7 @@ def alternatives(site: Site) -> list[Verdict]:
     return [_among(v, len(references) / part) for v in references] + [_among(v, len(sensors) / rest) for v in sensors]
 
 
-def suspects(found: list[Verdict], false_alarm: float = FALSE_ALARM) -> list[Verdict]:
+def suspects(found: list[DeviceVerdict], false_alarm: float = FALSE_ALARM) -> list[DeviceVerdict]:
     """The device that contradicts the others; `found` is from `verdicts`. Empty if none does.
 
     Several devices, the worst first, if the links cannot tell them apart: two references that disagree beside one
@@ -89,7 +89,7 @@ def suspects(found: list[Verdict], false_alarm: float = FALSE_ALARM) -> list[Ver
     ]
 
 
-def _reference(site: Site, name: str, messages: Sequence[Message]) -> list[Verdict]:
+def _reference(site: Site, name: str, messages: Sequence[EliminatedRows]) -> list[DeviceVerdict]:
     """A constant error of what the device indicates as a reference: of all axes, and of each axis alone."""
     own = site.place(name)
     index = np.unique(np.concatenate([own, *(m.index for m in messages)]))
@@ -108,11 +108,11 @@ def _reference(site: Site, name: str, messages: Sequence[Message]) -> list[Verdi
             error = (ways.T @ within.T @ pull)[tested] / shown[tested]
             bias = site.devices[name].root @ within @ ways[:, tested] @ error
             chi2 = float(np.sum(error**2 * shown[tested]))
-            found.append(Verdict(name, True, axis, chi2, float(tested.sum()), np.nan, bias))
+            found.append(DeviceVerdict(name, True, axis, chi2, float(tested.sum()), np.nan, bias))
     return found
 
 
-def _supposed(device: Device) -> dict[str, Array]:
+def _supposed(device: SiteDevice) -> dict[str, Array]:
     """The directions (k, d) of z in which the error is supposed: "" all, and "x", "y", "z" those of one axis alone."""
     found = {"": np.eye(device.root.shape[1])}
     u = np.linalg.norm(device.root, axis=1, keepdims=True)
@@ -126,7 +126,7 @@ def _supposed(device: Device) -> dict[str, Array]:
     return found
 
 
-def _sensor(site: Site, name: str) -> Verdict | None:
+def _sensor(site: Site, name: str) -> DeviceVerdict | None:
     """The sensor left out: its rows against what all others say."""
     leaf = site.leaf(name)
     if leaf.observed < LEAST_FREEDOM:
@@ -136,10 +136,12 @@ def _sensor(site: Site, name: str) -> Verdict | None:
     given = message.rows, message.index
     free = np.eye(len(left)) - site.core_covariance(*given, *given)
     statistic = float(left @ np.linalg.solve(free, left)) + message.left
-    return Verdict(name, False, "", statistic, leaf.observed, np.nan, np.full(len(site.devices[name].mean), np.nan))
+    return DeviceVerdict(
+        name, False, "", statistic, leaf.observed, np.nan, np.full(len(site.devices[name].mean), np.nan)
+    )
 
 
-def _among(verdict: Verdict, number: float) -> Verdict:
+def _among(verdict: DeviceVerdict, number: float) -> DeviceVerdict:
     """With its probability among so many tests."""
     from scipy.special import gammaincc  # its import takes 0.2 s
 

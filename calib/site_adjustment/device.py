@@ -27,7 +27,7 @@ CROSS = np.array(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Device:
+class SiteDevice:
     """What is known of a device before any link: x = mean + root z with independent z of variance 1.
 
     `mean` (n,); `root` (n, k). `wide` (k,) are true where nothing was stated: that z has no test.
@@ -39,7 +39,7 @@ class Device:
     wide: Array
 
     @classmethod
-    def known(cls, name: str, mean: Array, covariance: Array) -> Device:
+    def known(cls, name: str, mean: Array, covariance: Array) -> SiteDevice:
         """With a covariance (n, n), as from a certificate; 0 on its diagonal is exact, inf is not known at all.
 
         The scale of what is not known comes from `mean`, which then only is the point where the adjustment begins.
@@ -58,14 +58,14 @@ class Device:
         return cls(name, mean, root, np.arange(root.shape[1]) >= live.sum())
 
     @classmethod
-    def reference(cls, name: str, relative_u: float, channels: int) -> Device:
+    def reference(cls, name: str, relative_u: float, channels: int) -> SiteDevice:
         """A reference with one standard uncertainty for the sensitivity of each of its 1 or 3 channels."""
         u = np.zeros(12)
         u[[0, 4, 8][:channels]] = relative_u
         return cls.known(name, np.append(np.eye(3).ravel(), np.zeros(3)), np.diag(u**2))
 
     @classmethod
-    def gravity(cls, u_mps2: float) -> Device:
+    def gravity(cls, u_mps2: float) -> SiteDevice:
         """The error of the stated gravity, which all links share."""
         return cls.known(GRAVITY_NAME, np.zeros(1), np.full((1, 1), u_mps2**2))
 

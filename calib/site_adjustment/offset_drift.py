@@ -28,7 +28,7 @@ ROUNDING = 1e-12  # of what is known in a direction of y, which is 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drift:
+class OffsetDrift:
     """What the drift did: `output` (W, 3) added to the mean output of each window, in output unit; `covariance` (N, N)
     that it adds to that of [S, Q, nuisances], with the walk from the middle of the meeting to its begin or end."""
 
@@ -45,7 +45,7 @@ class Drift:
         return found
 
 
-def drift_of(found: Adjustment, windows: Sequence[Window]) -> Drift | None:
+def drift_of(found: Adjustment, windows: Sequence[Window]) -> OffsetDrift | None:
     """The drift that the windows show beside the adjustment of them; None if they show none.
 
     `windows` are those that were adjusted, in the same order.
@@ -69,11 +69,11 @@ def drift_of(found: Adjustment, windows: Sequence[Window]) -> Drift | None:
     output[known] = np.transpose([course.walk for course in courses]) / weight
     covariance = solution.half @ np.sum([course.more for course in courses], axis=0) @ solution.half.T
     covariance[range(9, 12), range(9, 12)] += 0.5 * np.array([course.variance for course in courses]) / unit
-    return Drift(output, covariance)
+    return OffsetDrift(output, covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Course:
+class _OffsetWalk:
     """The most likely walk (W,) of one output, and by how much the best walk improves chi-squared over none.
 
     `variance` of the walk over the whole time; `more` (N, N): by how much it enlarges the covariance of y, where
@@ -86,7 +86,7 @@ class _Course:
     more: Array
 
 
-def _course(left: Array, rows: Array, moved: Array, stated: float) -> _Course:
+def _course(left: Array, rows: Array, moved: Array, stated: float) -> _OffsetWalk:
     """The walk that the means of one output show.
 
     `left` (W,) is what the adjustment leaves of the means, `rows` (W, N) are those of y; `moved` (W, R) is what the R
@@ -115,7 +115,7 @@ def _course(left: Array, rows: Array, moved: Array, stated: float) -> _Course:
     share /= share.sum()
     apart = step - share @ step
     still = np.repeat(inverse[ratio == 0.0], len(WALKS), axis=0)  # with the same scatter, but without a walk
-    return _Course(
+    return _OffsetWalk(
         walk=ways @ np.sum(share[:, None] * walked * (left_along - step @ rows_along.T), axis=0),
         chi2=2.0 * float(likelihood.max() - likelihood[ratio == 0.0].max()),
         variance=float(share @ (scatter * ratio)),

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.site_adjustment.device import Device, beside
+from calib.site_adjustment.device import SiteDevice, beside
 from calib.site_adjustment.link import Link
 
 Index = NDArray[np.intp]
@@ -26,7 +26,7 @@ CONVERGED = 1e-3  # of the standard uncertainty that the priors state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Message:
+class EliminatedRows:
     """What the links of one eliminated sensor, or one link within the core, tell of the core: rows z = told.
 
     `index` (c,) are the unknowns of the core; the rows have the identity as covariance. `left`: sum of squares that no
@@ -48,7 +48,7 @@ class Eliminated:
     `observed`: rows of the links, less those that unknowns of the sensor without a prior take up.
     """
 
-    message: Message
+    message: EliminatedRows
     at: Array
     by_core: Array
     half: Array
@@ -59,7 +59,7 @@ class Eliminated:
 class Site:
     """The adjustment of all links. Raises ValueError for a device that is not known, or is its own reference."""
 
-    def __init__(self, devices: Sequence[Device], links: Sequence[Link]) -> None:
+    def __init__(self, devices: Sequence[SiteDevice], links: Sequence[Link]) -> None:
         self.devices = {d.name: d for d in devices}
         self._links = links
         of: dict[str, list[int]] = {}
@@ -116,11 +116,11 @@ class Site:
         wanted[other_index] = other_rows.T
         return np.asarray(rows @ self._factor.solve(wanted)[index])
 
-    def messages(self) -> list[Message]:
+    def messages(self) -> list[EliminatedRows]:
         """All that is known of the core beside its priors."""
         return [each.message for each in (*self._leaf.values(), *self._within)]
 
-    def core_of(self, message: Message) -> list[str]:
+    def core_of(self, message: EliminatedRows) -> list[str]:
         """The devices of the core that a message is about."""
         return list(dict.fromkeys(self._owner[k] for k in message.index))
 
@@ -260,12 +260,12 @@ class Site:
             wide = np.flatnonzero(self.devices[leaf].wide)
             observed = height - len(wide) + float(np.sum(half[wide] ** 2))
         return Eliminated(
-            Message(index, tail[:c, :c], tail[:c, c], float(tail[c, c] ** 2), by_reference),
+            EliminatedRows(index, tail[:c, :c], tail[:c, c], float(tail[c, c] ** 2), by_reference),
             half @ factor[:local, -1], -half @ factor[:local, local:-1], half, own, observed,
         )  # fmt: skip
 
 
-def _check_link(link: Link, devices: Mapping[str, Device]) -> None:
+def _check_link(link: Link, devices: Mapping[str, SiteDevice]) -> None:
     """Raise ValueError for a link with a device that is not there, or of a device with itself."""
     for name in (link.sensor, *_core_of(link)):
         if name not in devices:

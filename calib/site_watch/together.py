@@ -53,7 +53,7 @@ def design(value: Array, level: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joint:
+class JointChange:
     """For each begin (k): `size`, `u` (k, n, 7): the change in each of DIRECTIONS by itself. `rest` (k, n, B, 6):
     steps without what is common; `information` (k, n, B, 6): of these, over the variance."""
 
@@ -68,7 +68,7 @@ class Joint:
         return self.size / self.u
 
 
-def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: Array) -> Joint:
+def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: Array) -> JointChange:
     """All sensors at once, robustly: what a few sensors do differently does not move what is common.
 
     `step`, `information` (k, n, B, 6); `inflation` (k, n, 7): variance of each direction over what independent
@@ -84,7 +84,7 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
     known = squares > 0.0
     squares = np.where(known, squares, 1.0)
     variance = np.where(known, inflation / squares, np.inf)
-    return Joint(np.where(known, score / squares, 0.0), np.sqrt(variance + walk[:, None, None] ** 2), rest, alone)
+    return JointChange(np.where(known, score / squares, 0.0), np.sqrt(variance + walk[:, None, None] ** 2), rest, alone)
 
 
 def scores(values: Array, information: Array, G: Array) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib.distributions import NORMAL, student_quantile
 from calib.model import Array
 from calib.site_watch.steps import PRIOR_DEGREES, TERMS
-from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, Joint, jointly, median
+from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, jointly, median
 from calib.site_watch.watch import SiteWatch, pooled
 
 FALSE_ALARMS_PER_YEAR = 0.5  # of a whole site, at most, where the model of the scatter holds
@@ -37,7 +37,7 @@ EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told a
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class SensorVerdict:
     """A verdict of a sensor or gateway.
 
     `kind`: none, learning, sensitivity, turn, noise, structure, sensor or structure, gateway. `what`: in words.
@@ -56,11 +56,11 @@ class Told:
     statistic: float = 0.0
 
 
-NOTHING = Told("none")
+NOTHING = SensorVerdict("none")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Result:
+class SiteVerdicts:
     """The verdicts of a site on day `day`.
 
     `sensors` (n), `gateways` {number: verdict}, `site`. `least_detectable` (n, 3): relative change of the
@@ -71,14 +71,14 @@ class Result:
     """
 
     day: int
-    sensors: list[Told]
-    gateways: dict[int, Told]
-    site: Told
+    sensors: list[SensorVerdict]
+    gateways: dict[int, SensorVerdict]
+    site: SensorVerdict
     least_detectable: Array
     days: Array
     seen_degc: Array
     outside: NDArray[np.bool_]
-    common: Told | None
+    common: SensorVerdict | None
     hidden: float
     limit: float
 
@@ -89,7 +89,7 @@ class Tests:
     normal deviate; `bands` (k, n): that tell of a sensor."""
 
     begins: list[int]
-    joint: Joint
+    joint: JointChange
     apart: Array
     bands: Array
 
@@ -109,15 +109,15 @@ def limit_of(sensors: int, gateways: int, per_year: float = FALSE_ALARMS_PER_YEA
     return -NORMAL.inv_cdf(0.5 * per_year / (tests * LOOKS_PER_YEAR))
 
 
-def result(watch: SiteWatch, known_u: Array | None = None) -> Result:
+def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
     """The verdicts of today. `known_u` (n,): relative standard uncertainty of the sensitivity of each sensor that
     stands beside a reference; inf or NaN for the others."""
     n = watch.shape[0]
     anchored = np.zeros(n, dtype=bool) if known_u is None else np.isfinite(known_u)
     limit = limit_of(n, len(set(watch.gateway.tolist())))
     days = watch.steps.days.reshape(watch.shape).max(axis=(1, 2))
-    sensors = [NOTHING if d >= FEWEST_DAYS + FEWEST_SINCE else Told("learning") for d in days]
-    gateways: dict[int, Told] = {}
+    sensors = [NOTHING if d >= FEWEST_DAYS + FEWEST_SINCE else SensorVerdict("learning") for d in days]
+    gateways: dict[int, SensorVerdict] = {}
     site, common, least = NOTHING, None, np.full((n, 3), np.inf)
     tests = examined(watch)
     if tests is not None:
@@ -133,7 +133,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> Result:
         least = limit * tests.joint.u[month, :, :3]
     outside = (watch.degc < watch.seen_degc[:, 0]) | (watch.degc > watch.seen_degc[:, 1])
     hidden = common.U if common is not None else np.inf
-    return Result(
+    return SiteVerdicts(
         watch.day, sensors, gateways, site, least, days, watch.seen_degc.copy(), outside, common, hidden, limit
     )
 
@@ -165,7 +165,7 @@ def _without(variance: Array, size: Array, information: Array, days: Array) -> A
     return np.asarray(np.maximum(variance - size**2 * information / freedom, LEAST_VARIANCE * variance))
 
 
-def _apart(joint: Joint, G: Array) -> Array:
+def _apart(joint: JointChange, G: Array) -> Array:
     """How much the bands of each sensor differ from any change of its sensitivities and any turn, (k, n).
 
     What most sensors show, such as days that the norm does not fit, is taken as scatter.
@@ -188,7 +188,7 @@ def _apart(joint: Joint, G: Array) -> Array:
     return np.asarray(np.where(freedom > 0, deviate, -np.inf))
 
 
-def _sensor(tests: Tests, i: int, limit: float, noise: Told) -> Told:
+def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorVerdict:
     """The verdict of one sensor by itself."""
     statistic, apart = tests.joint.statistic[:, i], tests.apart[:, i]
     direction = int(np.argmax(np.abs(statistic).max(axis=0)))
@@ -196,16 +196,18 @@ def _sensor(tests: Tests, i: int, limit: float, noise: Told) -> Told:
     z = abs(float(statistic[best, direction]))
     if apart.max() > limit and (z <= limit or apart[best] > limit):
         worst, dates = tests.dated(np.maximum(apart, 0.0) ** 2)
-        return Told("sensor or structure", "its bands change differently", 0.0, np.inf, *dates, float(apart[worst]))
+        return SensorVerdict(
+            "sensor or structure", "its bands change differently", 0.0, np.inf, *dates, float(apart[worst])
+        )
     if z > limit:
         kind = "sensitivity" if direction <= ALL else "turn"
         kind = kind if tests.bands[best, i] >= FEWEST_BANDS else "sensor or structure"
         size, u = tests.joint.size[best, i, direction], tests.joint.u[best, i, direction]
-        return Told(kind, NAMES[direction], float(size), COVERAGE * float(u), *dates, z)
+        return SensorVerdict(kind, NAMES[direction], float(size), COVERAGE * float(u), *dates, z)
     return noise
 
 
-def _noise(watch: SiteWatch, limit: float) -> list[Told]:
+def _noise(watch: SiteWatch, limit: float) -> list[SensorVerdict]:
     """Has the noise floor of an output changed? For each sensor."""
     steps, shape = watch.noise, (watch.shape[0], 3)
     which = [k for k, begin in enumerate(steps.begins) if watch.day - begin + 1 >= FEWEST_SINCE]
@@ -220,18 +222,19 @@ def _noise(watch: SiteWatch, limit: float) -> list[Told]:
     for i in range(shape[0]):
         k, axis = np.unravel_index(int(np.argmax(z[:, i])), (len(which), 3))
         begin, factor = steps.begins[which[k]], float(np.exp(size[k, i, axis]))
-        found = Told("noise", f"noise of {'xyz'[axis]}", factor - 1.0, COVERAGE * float(u[k, i, axis]) * factor,
-                     begin, begin, begin, float(z[k, i, axis]))  # fmt: skip
+        expanded = COVERAGE * float(u[k, i, axis]) * factor
+        found = SensorVerdict("noise", f"noise of {'xyz'[axis]}", factor - 1.0, expanded,
+                              begin, begin, begin, float(z[k, i, axis]))  # fmt: skip
         few = student_quantile(NORMAL.cdf(limit), float(days[i, axis]) - TERMS + PRIOR_DEGREES)
         told.append(found if found.statistic > few else NOTHING)
     return told
 
 
-def _gateways(watch: SiteWatch, tests: Tests, sensors: list[Told], limit: float) -> dict[int, Told]:
+def _gateways(watch: SiteWatch, tests: Tests, sensors: list[SensorVerdict], limit: float) -> dict[int, SensorVerdict]:
     """All sensors of a gateway alike, against the median of all gateways. A sensor that its gateway explains is not
     told."""
     numbers, index = np.unique(watch.gateway, return_inverse=True)
-    told: dict[int, Told] = {}
+    told: dict[int, SensorVerdict] = {}
     if len(numbers) < 2:
         return told
     mean, u, fits = _means(tests.joint, index)
@@ -243,14 +246,14 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[Told], limit: float)
         z = abs(float(mean[best, g] / u[best, g]))
         alone = np.abs(tests.joint.statistic[best, own, SENSITIVITIES]).max()
         if z > max(limit, alone) and fits[best, g] and own.sum() > 1:
-            told[number] = Told("gateway", what, float(mean[best, g]), COVERAGE * float(u[best, g]), *dates, z)
+            told[number] = SensorVerdict("gateway", what, float(mean[best, g]), COVERAGE * float(u[best, g]), *dates, z)
     for i, verdict in enumerate(sensors):
         if verdict.kind == "sensitivity" and told and (pair or int(watch.gateway[i]) in told):
             sensors[i] = NOTHING
     return told
 
 
-def _means(joint: Joint, index: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def _means(joint: JointChange, index: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """Mean change of the sensors of each gateway against the median of the gateways (k, g), its u, and whether its
     sensors agree. Of two gateways: their difference."""
     s, weight = joint.size[:, :, ALL], 1.0 / np.square(joint.u[:, :, ALL])
@@ -267,7 +270,7 @@ def _means(joint: Joint, index: NDArray[np.int64]) -> tuple[Array, Array, Array]
     return np.nan_to_num(mean - centre[:, None]), np.sqrt(variance + others[:, None]), wrong == 0.0
 
 
-def _structure(tests: Tests, sensors: list[Told]) -> Told:
+def _structure(tests: Tests, sensors: list[SensorVerdict]) -> SensorVerdict:
     """Damage: bands change differently at several sensors, or at most of them."""
     own = [i for i, told in enumerate(sensors) if told.kind == "sensor or structure"]
     if len(own) >= 2:
@@ -279,12 +282,12 @@ def _structure(tests: Tests, sensors: list[Told]) -> Told:
                 sensors[i] = NOTHING
         for i in own:
             what = "its bands change differently, as those of other sensors do"
-            sensors[i] = Told("structure", what, 0.0, np.inf, *dates, sensors[i].statistic)
-        return Told("structure", f"bands change differently at {len(own)} sensors", 0.0, np.inf, *dates, z)
+            sensors[i] = SensorVerdict("structure", what, 0.0, np.inf, *dates, sensors[i].statistic)
+        return SensorVerdict("structure", f"bands change differently at {len(own)} sensors", 0.0, np.inf, *dates, z)
     return NOTHING
 
 
-def _common_change(tests: Tests, known_u: Array, anchored: Array) -> Told:
+def _common_change(tests: Tests, known_u: Array, anchored: Array) -> SensorVerdict:
     """What the sensors without a reference share, seen from those that have one: these change by known_u at most."""
     s, u = tests.joint.size[:, anchored, ALL], tests.joint.u[:, anchored, ALL]
     weight = 1.0 / (np.square(u) + 2.0 * np.square(known_u))
@@ -294,6 +297,6 @@ def _common_change(tests: Tests, known_u: Array, anchored: Array) -> Told:
     mean, u_mean = -np.sum(weight * s, axis=1) / total, np.where(some, 1.0 / np.sqrt(total), np.inf)
     best, dates = tests.dated(np.square(mean / u_mean))
     z = abs(float(mean[best] / u_mean[best]))
-    return Told(
+    return SensorVerdict(
         "common", "all sensors without a reference", float(mean[best]), COVERAGE * float(u_mean[best]), *dates, z
     )

@@ -82,7 +82,7 @@ def found_date(whole: Estimate, then: Then, day: float, begin: float, end: float
     edges = distinct(np.array([begin, end, *ends[(ends > begin) & (ends < end)]]))
     edges = edges[np.append(True, np.diff(edges) > APART_DAYS)]
     stated = {key: u for step in whole.unknowns.statements.steps if step.day == day for key, u in step.u.items()}
-    cost = cache(_Supposed(whole, day, _moves(then, stated)).cost)
+    cost = cache(_OnsetHypothesis(whole, day, _moves(then, stated)).cost)
     probability = _probability(cost, edges)
     for _ in range(ROUNDS):
         likely = np.asarray(probability > NEGLIGIBLE * probability.sum())
@@ -140,7 +140,7 @@ def _by_epoch(whole: Estimate) -> list[list[tuple[Record, Array]]]:
     return own
 
 
-class _Supposed:
+class _OnsetHypothesis:
     """The solution without a change, and what it costs to suppose the change at a time.
 
     A cost is chi-squared and the logarithm of the determinant of what is known, less a constant. `before` (K): the

@@ -12,7 +12,7 @@ import numpy as np
 from calib.estimate.estimate import Now
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE, Quantity
-from calib.estimate.response_told import Known, ResponseTold, response_told, told_at_one_frequency
+from calib.estimate.response_told import KnownResponses, ResponseTold, response_told, told_at_one_frequency
 from calib.model import Array
 from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, attenuating, by_term, in_units
 from calib.windows.deviations import Deviations, LeftOpen
@@ -223,7 +223,7 @@ class OverFrequency:
         factor, hz = self.factor(state, reference, priors)[chosen], self.stated(priors).reference_frequency_hz
         return response_told(
             state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0,
-            known=Known.of(self.stated(priors)),
+            known=KnownResponses.of(self.stated(priors)),
         )  # fmt: skip
 
     def log_h(self, state: Now, reference: str, frequency_hz: float) -> float:
@@ -249,7 +249,13 @@ class OverFrequency:
         factor, hz = self.factor(state, reference, priors)[chosen], self.stated(priors).reference_frequency_hz
         band_hz = (self.first_hz, self.first_hz)
         return told_at_one_frequency(
-            state.mean[chosen], factor @ factor.T, effects, hz, band_hz, coverage_factor, Known.of(self.stated(priors))
+            state.mean[chosen],
+            factor @ factor.T,
+            effects,
+            hz,
+            band_hz,
+            coverage_factor,
+            KnownResponses.of(self.stated(priors)),
         )
 
     def snapshot(self) -> dict[str, Any]:

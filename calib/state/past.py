@@ -18,7 +18,7 @@ FURTHEST_DAYS = 7.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class StatedChange:
     """What was stated to change at once on a day: a step, a remount, a calibration that an operator put in force.
 
     `stated`: standard uncertainties of the changes beforehand, by unknown. `found` and `standard_uncertainty` (12,): by
@@ -44,7 +44,7 @@ class Past:
     days: Array
     laws: Sequence[Law]
     windows: Sequence[int]
-    changes: Sequence[Change]
+    changes: Sequence[StatedChange]
     begin: float
     coverage_factor: float
 

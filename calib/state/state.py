@@ -40,10 +40,10 @@ from calib.model import Array, Calibration, scale_of
 from calib.signal.response import Response
 from calib.state.dating import Date, found_date, stated_date
 from calib.state.over_frequency import SEVERAL, OverFrequency, changed
-from calib.state.past import Change, Past, epoch_days
+from calib.state.past import Past, StatedChange, epoch_days
 from calib.state.sources import Sources
 from calib.state.thinning import NEWEST, thinned
-from calib.state.walks import Shown, shown
+from calib.state.walks import ReferenceView, shown
 from calib.windows.never_turned import never_turned
 from calib.windows.record import Record, together
 
@@ -379,13 +379,13 @@ class State:
             if step.day > min(counts):
                 own = stated.setdefault(step.day, {})
                 own |= {key: float(np.hypot(u, own.get(key, 0.0))) for key, u in step.u.items()}
-        whole, laws, changes = self.estimate(also=epoch_days(counts, stated)), list[Law](), list[Change]()
+        whole, laws, changes = self.estimate(also=epoch_days(counts, stated)), list[Law](), list[StatedChange]()
         days = whole.days.tolist()
         for then, after in zip(whole.past(), [np.inf, *reversed(days)], strict=False):
             laws.append(self._law(then.now, *self._values_of(then.now)))
             if after in stated:
                 dated = self._dated_by(whole, then, after, [begin, *stated, days[-1]])
-                changes.append(Change(after, stated[after], *self._change_of(then), dated))
+                changes.append(StatedChange(after, stated[after], *self._change_of(then), dated))
         windows = [counts[day] for day in days]
         return Past(whole.days, laws[::-1], windows, changes[::-1], begin, self.coverage_factor)
 
@@ -537,7 +537,7 @@ class State:
         other._records, other._steps, other._dated = list(self._records), list(self._steps), list(self._dated)
         return other
 
-    def shown(self) -> dict[str, Shown]:
+    def shown(self) -> dict[str, ReferenceView]:
         """S and Q as each present reference shows them; of references with a window."""
         newest = {r.reference: r for r in self._records if r.reference in self._present}
         return {reference: shown(self._now, record, fixed=self._fixed) for reference, record in newest.items()}

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.model import Array
 from calib.windows.deviations import Deviations, LeftOpen
-from calib.windows.excited import Motion
+from calib.windows.excited import MotionSums
 from calib.windows.record import TERMS, TOLD, Record
 
 NEWEST = 48  # records that stay as they are: four times round twelve positions
@@ -103,7 +103,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
         count=float(sum(each("count"))), told=_triangle(np.vstack(each("told")), TOLD),
         deviations=reduce(Deviations.plus, each("deviations"), Deviations()),
         left_open=reduce(LeftOpen.plus, each("left_open"), LeftOpen()), mean_hz=by_windows("mean_hz"),
-        motion=reduce(Motion.plus, motions) if motions else None,
+        motion=reduce(MotionSums.plus, motions) if motions else None,
         to_hz=max(each("to_hz")), bands=None, reference_noise=None,
     )  # fmt: skip
 

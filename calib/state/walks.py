@@ -45,7 +45,7 @@ Makers = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shown:
+class ReferenceView:
     """S and Q as one reference shows them on a day, (12,) each: `value`, its variance, its covariance with its rate.
 
     What is stated of a change: the variance of its `walk` a day, that of its steady `rate`, and that of the walk of its
@@ -64,7 +64,7 @@ class Shown:
     fixed: bool
 
 
-def shown(now: Now, record: Record, *, fixed: bool) -> Shown:
+def shown(now: Now, record: Record, *, fixed: bool) -> ReferenceView:
     """S and Q as the reference of a record, its newest one, shows them. `fixed`: the mount never turns."""
     unknowns, scale = now.unknowns.all, now.unknowns.statements.scale
     jacobian = np.eye(12, len(now))
@@ -80,7 +80,7 @@ def shown(now: Now, record: Record, *, fixed: bool) -> Shown:
     rates, half = [now.index(name) for name in RATES], jacobian @ now.factor
     a_day, u = (np.array([getattr(unknown, name) for unknown in unknowns]) for name in ("a_day", "u"))
     none = np.zeros(9)
-    return Shown(
+    return ReferenceView(
         now.day, jacobian @ now.mean, np.sum(half**2, axis=1),
         np.append(none, np.sum(half[9:] * now.factor[rates], axis=1)),
         jacobian**2 @ a_day, np.append(none, u[rates] ** 2), np.append(none, a_day[rates]), makers, fixed,
@@ -108,7 +108,7 @@ def _lean(now: Now, record: Record, makers: Sequence[dict[str, tuple[float, floa
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Course:
+class _ReferenceCourse:
     """What a reference showed: `days` (K,), their numbers (K,), and value, variance, covariance with the rate
     (K, 3, 12)."""
 
@@ -117,10 +117,10 @@ class _Course:
     kept: Array
 
     @classmethod
-    def begun(cls) -> _Course:
+    def begun(cls) -> _ReferenceCourse:
         return cls(np.empty(0), np.empty(0, dtype=np.int64), np.empty((0, 3, 12)))
 
-    def after(self, now: Shown) -> _Course:
+    def after(self, now: ReferenceView) -> _ReferenceCourse:
         """With one more day; days that are close to others are dropped, the older the more."""
         if len(self.days) and now.day <= self.days[-1]:
             return self
@@ -129,9 +129,9 @@ class _Course:
         kept = np.concatenate([self.kept, np.array([[now.value, now.variance, now.with_rate]])])
         octave = np.maximum(np.frexp((number + 1 - numbers) / DENSE)[1] - 1, 0)
         keep = (numbers % (1 << octave) == 0) & (now.day - days <= LONGEST_DAYS)
-        return _Course(days[keep], numbers[keep], kept[keep])
+        return _ReferenceCourse(days[keep], numbers[keep], kept[keep])
 
-    def changes(self, now: Shown) -> tuple[Array, Array] | None:
+    def changes(self, now: ReferenceView) -> tuple[Array, Array] | None:
         """Sizes, standard deviations and first days (3, 12) of net changes: the most significant ones, and the largest
         of those beyond WIDENS standard deviations (0 where there is none)."""
         span = now.day - self.days
@@ -149,7 +149,7 @@ class _Course:
         every = np.arange(12)
         return found[:, best, every], np.where(far[most, every] != 0.0, found[:, most, every], 0.0)
 
-    def change(self, p: int, since: float, now: Shown) -> float | None:
+    def change(self, p: int, since: float, now: ReferenceView) -> float | None:
         """The net change of one parameter since about that day; None where no such day is kept."""
         if not len(self.days):
             return None
@@ -160,7 +160,7 @@ class _Course:
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _ReportedChange:
     """A change that was told: of a parameter beside a reference, by `size`; `said` is the size when it was told."""
 
     reference: str
@@ -177,8 +177,8 @@ class Walks:
     def __init__(self, false_alarms_a_year: float) -> None:
         """`false_alarms_a_year`: of all parameters beside all references together."""
         self._rate = false_alarms_a_year
-        self._courses: dict[str, _Course] = {}
-        self._told: dict[tuple[str, int], _Told] = {}
+        self._courses: dict[str, _ReferenceCourse] = {}
+        self._told: dict[tuple[str, int], _ReportedChange] = {}
         self._past: list[Widening] = []  # of before a restart
         self._ended: list[int] = []  # parameters whose verdict ended with it
         self._fixed = True
@@ -194,7 +194,7 @@ class Walks:
         tests = 9 * references + 3
         return false_alarm_threshold(self._rate / YEAR_DAYS / tests, SHORTEST_DAYS, LONGEST_DAYS)
 
-    def update(self, by_reference: Mapping[str, Shown]) -> list[DriftVerdict]:
+    def update(self, by_reference: Mapping[str, ReferenceView]) -> list[DriftVerdict]:
         """Take what each reference shows. Returns the verdicts that are to be told."""
         if self._fixed and not all(now.fixed for now in by_reference.values()):
             self.restart()
@@ -202,7 +202,7 @@ class Walks:
         news = [DriftVerdict(PARAMETERS[p]) for p in self._ended]
         self._ended, self.widened = [], []
         for k, (reference, now) in enumerate(by_reference.items()):
-            course = self._courses.pop(reference, _Course.begun())
+            course = self._courses.pop(reference, _ReferenceCourse.begun())
             if (found := course.changes(now)) is not None:
                 for p in range(12 if k == 0 else 9):
                     best, most = (values[:, p].tolist() for values in found)
@@ -218,7 +218,7 @@ class Walks:
         p: int,
         best: Sequence[float],
         most: Sequence[float],
-        by_reference: Mapping[str, Shown],
+        by_reference: Mapping[str, ReferenceView],
     ) -> list[DriftVerdict]:
         before, now = self._told.get((reference, p)), by_reference[reference]
         threshold, statistic = self.threshold(len(by_reference)), 0.5 * (best[0] / best[1]) ** 2
@@ -230,7 +230,7 @@ class Walks:
                 self.widened.append(_widening(now.makers[p], size, since, now.day))
             return []
         makers, cause = self._cause(reference, p, size, since, by_reference)
-        told = _Told(reference, p, size, abs(size), _widening(makers, size, since, now.day))
+        told = _ReportedChange(reference, p, size, abs(size), _widening(makers, size, since, now.day))
         if before is not None and abs(size) < AGAIN * before.said:
             self._told[reference, p] = replace(told, said=before.said)
             return []
@@ -247,7 +247,7 @@ class Walks:
         ]
 
     def _cause(
-        self, reference: str, p: int, size: float, since: float, by_reference: Mapping[str, Shown]
+        self, reference: str, p: int, size: float, since: float, by_reference: Mapping[str, ReferenceView]
     ) -> tuple[Makers, str]:
         """What may have made a change, and a sentence on it."""
         makers = by_reference[reference].makers[p]
@@ -257,7 +257,9 @@ class Walks:
         if not others:
             return makers, "sensor, or its mounting beside the reference"
         for other, now in by_reference.items():
-            beside = self._courses.get(other, _Course.begun()).change(p, since, now) if other != reference else None
+            beside = (
+                self._courses.get(other, _ReferenceCourse.begun()).change(p, since, now) if other != reference else None
+            )
             if beside is not None and beside * np.sign(size) > PARTED * abs(size):
                 return {own: makers[own]}, f"sensor, because {other} shows the same"
             if beside is not None:
@@ -293,8 +295,8 @@ class Walks:
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Continue from the state that `snapshot` returned."""
-        self._courses = {reference: _Course(**own) for reference, own in state["courses"].items()}
-        loaded = (_Told(**{**told, "widening": Widening(**told["widening"])}) for told in state["told"])
+        self._courses = {reference: _ReferenceCourse(**own) for reference, own in state["courses"].items()}
+        loaded = (_ReportedChange(**{**told, "widening": Widening(**told["widening"])}) for told in state["told"])
         self._told = {(told.reference, told.parameter): told for told in loaded}
         self._past = [Widening(**widening) for widening in state["past"]]
         self._ended, self._fixed = list(state["ended"]), state["fixed"]

@@ -37,7 +37,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class WantedUncertainty:
     """The expanded uncertainties (k = 2) that are wanted, relative to the main sensitivity."""
 
     main: float = 5e-4
@@ -74,7 +74,7 @@ class Expected:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joint:
+class JointCovariance:
     """What is known of S, Q and the nuisances: `quantities` (N), `mean` (N,), `covariance` (N, N).
 
     `scale` is the output unit per m/s2.
@@ -86,7 +86,7 @@ class Joint:
     scale: float
 
     @classmethod
-    def before(cls, priors: Priors, scale: float = 1.0) -> Joint:
+    def before(cls, priors: Priors, scale: float = 1.0) -> JointCovariance:
         """Before the first stop. `scale`: the nominal sensitivity, where `priors` have no S."""
         u = scale * np.append(np.full(9, U_SENSITIVITY), np.full(3, U_OFFSET_MPS2))
         mean, covariance = scale * np.append(np.eye(3).ravel(), np.zeros(3)), np.diag(u**2)
@@ -97,14 +97,14 @@ class Joint:
         return cls(tuple(q.key for q in S_AND_Q), mean, covariance, scale)
 
     @classmethod
-    def after(cls, found: Adjustment) -> Joint:
+    def after(cls, found: Adjustment) -> JointCovariance:
         """After an adjustment, given the reference as it is."""
         names = [*(q.key for q in S_AND_Q), *(Quantity(n.name, n.kind).key for n in found.nuisances)]
         own = np.array([False] * 12 + [n.kind in (REFERENCE, REFERENCE_DRIFT) for n in found.nuisances])
         scale = float(np.sqrt(np.mean(found.mean[[0, 4, 8]] ** 2)))
         return cls(tuple(names), found.mean, found.covariance, scale)._given(own)
 
-    def _given(self, known: Flags) -> Joint:
+    def _given(self, known: Flags) -> JointCovariance:
         """The same if the quantities `known` (N,) were exact."""
         rest = ~known
         shared = self.covariance[np.ix_(rest, known)]
@@ -145,7 +145,7 @@ class Suggestion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class StopIndications:
     """What the window of a stop told: `slopes` (3, m) output over motion, `mean` (3,) output without motion.
 
     `reference_mps2` (m,): the mean of the reference, by which it feels gravity.
@@ -156,7 +156,7 @@ class Told:
     reference_mps2: Array
 
     @classmethod
-    def of(cls, window: Window) -> Told:
+    def of(cls, window: Window) -> StopIndications:
         """Of a window with m channels, by a regression of its sums on the motion and its derivative."""
         m, whole = window.sums.reference_channels, pool(window.sums)
         scatter, mean = whole.scatter[0], whole.mean[0]
@@ -195,21 +195,21 @@ class Plan:
         self._felt, self._d_felt = felt[0].real, felt[1:].imag / STEP
         self._offset = at.offset[1:].imag / STEP
 
-    def after(self, joint: Joint, stop: int, expected: Expected) -> Joint:
+    def after(self, joint: JointCovariance, stop: int, expected: Expected) -> JointCovariance:
         """What is known after this stop."""
         joint = self._with(joint, self._own[:, stop])
         rows, noise = self._rows(joint, expected, [stop])
         gain = _gain(joint.covariance, rows, noise)
         return replace(joint, covariance=joint.covariance - (gain @ rows @ joint.covariance)[0])
 
-    def shared(self, joint: Joint) -> Joint:
+    def shared(self, joint: JointCovariance) -> JointCovariance:
         """The same with every quantity that all positions share, also before the first stop.
 
         What several stops tell together depends on it: an error that they share does not average out.
         """
         return self._with(joint, self._common)
 
-    def _with(self, joint: Joint, needed: Flags) -> Joint:
+    def _with(self, joint: JointCovariance, needed: Flags) -> JointCovariance:
         """The same with the `needed` ones of all nuisances (J,), as they are known beforehand."""
         new = [j for j in np.flatnonzero(needed) if self._names[j] not in joint.quantities]
         n, more = len(joint.quantities), len(new)
@@ -217,9 +217,9 @@ class Plan:
         covariance[:n, :n] = joint.covariance
         covariance[range(n, n + more), range(n, n + more)] = self._u[new] ** 2
         names = joint.quantities + tuple(self._names[j] for j in new)
-        return Joint(names, np.append(joint.mean, np.zeros(more)), covariance, joint.scale)
+        return JointCovariance(names, np.append(joint.mean, np.zeros(more)), covariance, joint.scale)
 
-    def suggestions(self, joint: Joint, expected: Expected, wanted: Wanted) -> list[Suggestion]:
+    def suggestions(self, joint: JointCovariance, expected: Expected, wanted: WantedUncertainty) -> list[Suggestion]:
         """All stops, the one that brings S nearest to what is wanted first."""
         every = list(range(len(self.poses)))
         rows, noise = self._rows(joint, expected, every)
@@ -230,7 +230,7 @@ class Plan:
         order = np.argsort(wanted.cost(expanded), kind="stable")
         return [Suggestion(int(p), expanded[p]) for p in order]
 
-    def surprise(self, joint: Joint, told: Told, expected: Expected) -> Array:
+    def surprise(self, joint: JointCovariance, told: StopIndications, expected: Expected) -> Array:
         """(P,) how badly what a window told fits each of the stops: chi2, with 3 (m + 1) degrees of freedom.
 
         Beside a reference that feels gravity, the reference tells how the sensor stands, and all stops fit alike.
@@ -249,14 +249,14 @@ class Plan:
         spread = rows @ joint.covariance @ rows.transpose(0, 2, 1) + noise
         return np.asarray(np.einsum("pr,pr->p", off, np.linalg.solve(spread, off[..., None])[..., 0]))
 
-    def floor(self, joint: Joint, expected: Expected) -> tuple[Array, dict[str, Array]]:
+    def floor(self, joint: JointCovariance, expected: Expected) -> tuple[Array, dict[str, Array]]:
         """The expanded uncertainties (9,) after any number of stops, each taken anew and with errors of its own.
 
         And what they would be if a quantity that all positions share were exact, by its name.
         """
         start = self.shared(joint)
         kept = np.isin(start.quantities, [q.key for q in S_AND_Q] + list(np.array(self._names)[self._common]))
-        start = Joint(
+        start = JointCovariance(
             tuple(name for name, keep in zip(start.quantities, kept, strict=True) if keep),
             start.mean[kept], start.covariance[np.ix_(kept, kept)], start.scale,
         )  # fmt: skip
@@ -272,7 +272,7 @@ class Plan:
 
         return left(""), {name: left(name) for name in start.quantities[12:]}
 
-    def information(self, joint: Joint, expected: Expected) -> Array:
+    def information(self, joint: JointCovariance, expected: Expected) -> Array:
         """(P, N, N) what each stop would add to the inverse of the covariance.
 
         Stops of the same position are taken to have errors of their own, unless the position was taken before.
@@ -280,7 +280,7 @@ class Plan:
         rows, noise = self._rows(joint, expected, list(range(len(self.poses))))
         return np.asarray(rows.transpose(0, 2, 1) @ np.linalg.solve(noise, rows))
 
-    def _rows(self, joint: Joint, expected: Expected, stops: list[int]) -> tuple[Array, Array]:
+    def _rows(self, joint: JointCovariance, expected: Expected, stops: list[int]) -> tuple[Array, Array]:
         """Rows (P, 3 (m + 1), N) of the windows of these stops, and the covariances of their noise.
 
         A nuisance of a position that is not in the joint state is part of the noise.

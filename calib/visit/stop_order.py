@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.visit.next_stop import COVERAGE_FACTOR, Expected, Joint, Plan, Suggestion, Wanted
+from calib.visit.next_stop import COVERAGE_FACTOR, Expected, JointCovariance, Plan, Suggestion, WantedUncertainty
 
 ALL_SETS = 20_000  # so many sets are all looked at: half a second
 AT_ONCE = 2000  # sets whose covariances are in memory together
@@ -20,7 +20,9 @@ SWEEPS = 6  # of exchanges; three settle it as a rule
 TOGETHER = 16  # more stops are not exchanged: among so many the choice of one matters little
 
 
-def stops_ahead(plan: Plan, joint: Joint, expected: Expected, wanted: Wanted, most: int) -> list[Suggestion]:
+def stops_ahead(
+    plan: Plan, joint: JointCovariance, expected: Expected, wanted: WantedUncertainty, most: int
+) -> list[Suggestion]:
     """Stops until all is as wanted, as few as were found, `most` at most; each with the uncertainties after it.
 
     They keep the inclination of the clamp as long as they can. First each is the best next one. Then the best set of as
@@ -29,7 +31,7 @@ def stops_ahead(plan: Plan, joint: Joint, expected: Expected, wanted: Wanted, mo
     found = _one_by_one(plan, joint, expected, wanted, most)
     if not found or not wanted.reached(found[-1].expanded) or len(found) > TOGETHER:
         return found
-    together, stops = Together(plan, joint, expected, wanted), [each.stop for each in found]
+    together, stops = StopSets(plan, joint, expected, wanted), [each.stop for each in found]
     best, expanded = together.best(stops)
     while len(best) > 1:
         fewer, expanded = together.best(best[:-1])
@@ -39,7 +41,9 @@ def stops_ahead(plan: Plan, joint: Joint, expected: Expected, wanted: Wanted, mo
     return _in_order(plan, joint, expected, wanted, best)
 
 
-def _one_by_one(plan: Plan, joint: Joint, expected: Expected, wanted: Wanted, most: int) -> list[Suggestion]:
+def _one_by_one(
+    plan: Plan, joint: JointCovariance, expected: Expected, wanted: WantedUncertainty, most: int
+) -> list[Suggestion]:
     found: list[Suggestion] = []
     while len(found) < most and not wanted.reached(joint.expanded):
         best = plan.suggestions(joint, expected, wanted)[0]
@@ -48,10 +52,10 @@ def _one_by_one(plan: Plan, joint: Joint, expected: Expected, wanted: Wanted, mo
     return found
 
 
-class Together:
+class StopSets:
     """Sets of stops, none twice, with what each stop adds to the inverse of the covariance (P, N, N)."""
 
-    def __init__(self, plan: Plan, joint: Joint, expected: Expected, wanted: Wanted) -> None:
+    def __init__(self, plan: Plan, joint: JointCovariance, expected: Expected, wanted: WantedUncertainty) -> None:
         joint = plan.shared(joint)
         self._scale, self._main, self._wanted = np.sqrt(np.diag(joint.covariance)), joint.main, wanted
         square = np.outer(self._scale, self._scale)
@@ -113,7 +117,9 @@ class Together:
         return np.asarray(COVERAGE_FACTOR * np.sqrt(np.maximum(variance, 0.0)) * self._scale[:9] / self._main)
 
 
-def _in_order(plan: Plan, joint: Joint, expected: Expected, wanted: Wanted, stops: Sequence[int]) -> list[Suggestion]:
+def _in_order(
+    plan: Plan, joint: JointCovariance, expected: Expected, wanted: WantedUncertainty, stops: Sequence[int]
+) -> list[Suggestion]:
     """The stops, of which the one that gains most comes first, and then those of the same inclination."""
     left, found, theta_rad = list(stops), [], None
     while left:

@@ -64,7 +64,7 @@ def banded(
     sines and of their harmonics, which tell no term of the response. `powers`: how many terms there are.
     """
     projected = np.array([_at_one_frequency(np.sqrt(square), channels, powers) for square in mean_omega2.tolist()])
-    together, left_open = _Together(powers), LeftOpen()
+    together, left_open = _PooledBands(powers), LeftOpen()
     for w, own in enumerate(bands):
         if own is None or own.reference_channels != channels:
             continue
@@ -177,7 +177,7 @@ def _as_in_the_window(factors: Factors, omega2: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Told:
+class _WindowBands:
     """What the three axes of a window say of the terms, whatever their rows of B and their lags are.
 
     `residual` (R,) and `moves` (R, K) are whitened, and orthogonal to all that B and the lag can do. `signal` (R,) is
@@ -193,7 +193,7 @@ class _Told:
     free: int
 
 
-def _told(factors: Factors, powers: int) -> _Told:
+def _told(factors: Factors, powers: int) -> _WindowBands:
     terms = by_term(factors.omega, powers)
     own = factors.seen(np.ones(len(terms), dtype=complex))
     lagged = factors.seen(-1j * factors.omega)
@@ -209,7 +209,7 @@ def _told(factors: Factors, powers: int) -> _Told:
     rows = np.concatenate([observed[..., None], *(factors.seen(terms.T) @ gain)], axis=2)
     rows = (rows - ways @ (ways.transpose(0, 2, 1) @ rows)).reshape(-1, 1 + powers)
     at_hz, noise = np.tile(factors.by_row(factors.middle_hz), 3), factors.by_row(factors.noise.T).ravel()
-    return _Told(rows[:, 0], rows[:, 1:], observed.ravel(), at_hz, noise, 3 * free.shape[2])
+    return _WindowBands(rows[:, 0], rows[:, 1:], observed.ravel(), at_hz, noise, 3 * free.shape[2])
 
 
 def _left_open(factors: Factors, powers: int) -> LeftOpen:
@@ -238,7 +238,7 @@ def _fitted(columns: Array, observed: Array) -> Array:
     return np.asarray((np.linalg.pinv(columns / unit, RELATED) @ observed[..., None]) / unit.transpose(0, 2, 1))
 
 
-class _Together:
+class _PooledBands:
     """What the windows say of the terms together: only what the terms can change is kept of the rows of all windows,
     as many rows as there are terms, and the sums of Deviations. So memory does not grow with the windows."""
 
@@ -249,7 +249,7 @@ class _Together:
         # For each third of an octave: sums of signal variance [moves, residual], and of size variance.
         self._thirds: dict[int, Array] = {}
 
-    def add(self, told: _Told) -> None:
+    def add(self, told: _WindowBands) -> None:
         """Add what a window says."""
         rows = np.column_stack([told.moves, told.residual])
         self._triangle = np.asarray(np.linalg.qr(np.vstack([self._triangle, rows]), mode="r"), dtype=np.float64)

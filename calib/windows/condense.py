@@ -29,7 +29,7 @@ SHARED = 0.5
 ROUNDING = 1e-12  # of a channel's mean: in a window in which it is constant, digits alone move it by less
 
 
-class Summed(Protocol):
+class WindowToCondense(Protocol):
     """What is condensed: a calib.model.Window, or what calib.windows.excited leaves of it."""
 
     @property
@@ -69,7 +69,7 @@ class Condensed:
 
 
 def condense(
-    windows: Sequence[Summed],
+    windows: Sequence[WindowToCondense],
     *,
     alike: bool = False,
     response_hz: float = 0.0,
@@ -147,7 +147,7 @@ def effective(data: Condensed, independent: Array) -> Condensed:
     )
 
 
-def _segments(windows: Sequence[Summed], sums: Sequence[WindowSums], channels: int) -> list[Segments]:
+def _segments(windows: Sequence[WindowToCondense], sums: Sequence[WindowSums], channels: int) -> list[Segments]:
     """Sums of the windows by segment, centred on each window's mean; windows of one shape together."""
     shapes: dict[tuple[int, int], list[int]] = {}
     for w, own in enumerate(sums):
@@ -155,7 +155,7 @@ def _segments(windows: Sequence[Summed], sums: Sequence[WindowSums], channels: i
     return [_alike(np.array(at), windows, [sums[w] for w in at], channels) for at in shapes.values()]
 
 
-def _alike(at: Index, windows: Sequence[Summed], sums: Sequence[WindowSums], channels: int) -> Segments:
+def _alike(at: Index, windows: Sequence[WindowToCondense], sums: Sequence[WindowSums], channels: int) -> Segments:
     """`sums` of the windows `at`, equal in segments and channels; channels that they do not have are zeros."""
     own = sums[0].reference_channels
     keep = np.array([*range(own), *range(channels, channels + own), *range(2 * channels, 2 * channels + 3)])

@@ -123,29 +123,29 @@ def excited_together(windows: Sequence[Window]) -> tuple[list[Excitation], Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class MotionSums:
     """Sums over the points of a window beside a tri-axial reference, in the sensor's frame: `power` (3, 3) of its
     motion, the noise's subtracted, and `noise` (3, 3) of the reference's noise, in m2/s4."""
 
     power: Array
     noise: Array
 
-    def plus(self, other: Motion) -> Motion:
+    def plus(self, other: MotionSums) -> MotionSums:
         """Both together."""
-        return Motion(self.power + other.power, self.noise + other.noise)
+        return MotionSums(self.power + other.power, self.noise + other.noise)
 
 
-def motion_of(window: Window) -> Motion:
+def motion_of(window: Window) -> MotionSums:
     """The motion in a window beside a tri-axial reference."""
     m, points = len(AXES), float(window.sums.count.sum())
     direction, noise = window.pose.direction[:, :m], np.zeros(m)
     if window.reference_noise is not None:
         noise = window.reference_noise[0] ** 2
     power = _power(window)[:m, :m] - np.diag(noise)
-    return Motion(points * direction @ power @ direction.T, points * (direction * noise) @ direction.T)
+    return MotionSums(points * direction @ power @ direction.T, points * (direction * noise) @ direction.T)
 
 
-def excited_ways(motions: Sequence[Motion]) -> Array:
+def excited_ways(motions: Sequence[MotionSums]) -> Array:
     """(3, k) the eigenvectors of the motion of all windows along which at least one of them moves: more than noise, and
     more than 1 % of its strongest motion."""
     power, noise = (np.array([getattr(motion, name) for motion in motions]) for name in ("power", "noise"))

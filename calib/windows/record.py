@@ -18,7 +18,7 @@ from calib.signal.response import ALL_POWERS
 from calib.windows.bands import ABOVE, HIGHEST, motion_band_hz, parts, share_above
 from calib.windows.condense import Condensed, condense, mean_frequency_hz, regressed
 from calib.windows.deviations import Deviations, LeftOpen
-from calib.windows.excited import Motion, excited, excited_together, excited_ways, motion_of
+from calib.windows.excited import MotionSums, excited, excited_together, excited_ways, motion_of
 from calib.windows.never_turned import mean_input
 
 TERMS = len(ALL_POWERS)  # of the response over frequency, at most
@@ -89,7 +89,7 @@ class Record:
     left_open: LeftOpen
     motion_hz: tuple[float, float] | None
     mean_hz: float
-    motion: Motion | None = None
+    motion: MotionSums | None = None
     to_hz: float = np.inf
     behind_k: float = 0.0
     bands: BandSums | None = None
@@ -241,7 +241,7 @@ class Record:
         own = {
             "pose": Pose(**state["pose"]), "deviations": Deviations(**state["deviations"]),
             "left_open": LeftOpen.load(state["left_open"]), "motion_hz": None if band is None else (band[0], band[1]),
-            "motion": None if motion is None else Motion(**motion),
+            "motion": None if motion is None else MotionSums(**motion),
             "bands": None if bands is None else BandSums(**bands),
         }  # fmt: skip
         return cls(**{**state, **pairs, **own})

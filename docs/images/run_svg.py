@@ -16,9 +16,9 @@ from rich.console import Console
 
 from agent.acquisition.service import Service
 from agent.cli.run import LOOPBACK, router, virtual_bench
-from agent.cli.stopping import Run
-from agent.terminal.screen import Picture
-from agent.terminal.watch import Watch
+from agent.cli.stopping import StoppableRun
+from agent.terminal.screen import ScreenPicture
+from agent.terminal.watch import RunView
 
 HERE = Path(__file__).parent
 
@@ -27,14 +27,14 @@ def main() -> None:
     """Run for a minute, draw the last state."""
     with ExitStack() as stack:
         os.chdir(stack.enter_context(tempfile.TemporaryDirectory()))
-        said = stack.enter_context(router(LOOPBACK, Run()))
+        said = stack.enter_context(router(LOOPBACK, StoppableRun()))
         config, truth = stack.enter_context(virtual_bench("plain", 1))
-        watch = stack.enter_context(Watch(config, "virtual bench, plain", truth))
+        watch = stack.enter_context(RunView(config, "virtual bench, plain", truth))
         watch.say(said)
         Service(config, Path("data"), watch).run(56.0)
         nowhere = stack.enter_context(open(os.devnull, "w"))
         console = Console(record=True, width=100, height=30, file=nowhere, force_terminal=True)
-        console.print(Picture(watch.state))
+        console.print(ScreenPicture(watch.state))
         console.save_svg(str(HERE / "run.svg"), title="make run")
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib.estimate.nuisances import Priors
 from calib.geometry import STANDARD_GRAVITY_MPS2, clamp, on_axis
 from calib.model import Pose
-from calib.paper.amplitudes import Run
+from calib.paper.amplitudes import SineRun
 from hw.virtual.bench import Bench
 from hw.virtual.motion import sine
 from hw.virtual.parameters import BenchParameters, ClampErrors, ReferenceParameters, SensorParameters
@@ -136,7 +136,7 @@ def record(
     seed: int,
     repetitions: int = 3,
     rate_hz: float = 1000.0,
-) -> list[Run]:
+) -> list[SineRun]:
     """Record all runs: the positions in order, `repetitions` times, six cycles each, with an LDV as the reference."""
     hold_s = CYCLES / frequency_hz + 2 / rate_hz
     stands = _stands(device, faults, hold_s)
@@ -164,7 +164,7 @@ def record(
     for k, interval in enumerate(recording.poses):
         part = slice(*np.searchsorted(time, (interval.start_s, interval.stop_s)))
         reference, v = recording.reference[part, 0], recording.v[part]
-        runs.append(Run(time[part], reference, v, nominal[k % len(nominal)], "velocity"))
+        runs.append(SineRun(time[part], reference, v, nominal[k % len(nominal)], "velocity"))
     return runs
 
 

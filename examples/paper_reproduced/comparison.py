@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from calib.estimate.nuisances import Priors
 from calib.model import Array, Window, WindowSums
 from calib.paper import method1, method2, method3, method3_budget
-from calib.paper.amplitudes import AmplitudeCalibration, Run
-from calib.paper.propagation import Statement
+from calib.paper.amplitudes import AmplitudeCalibration, SineRun
+from calib.paper.propagation import MethodUncertainty
 from calib.paper.sine_fit import cycle_edges, four_parameter
 from calib.paper.statistics import differences_pct, rel_s_pct, repeatability
 from calib.windows.sums import window_sums
@@ -33,7 +33,7 @@ class Comparison:
     two: AmplitudeCalibration
     three: method3.Fit
     windows: Sequence[Window]  # of Method 3; each cycle is a segment
-    statements: dict[int, Statement]
+    statements: dict[int, MethodUncertainty]
     sensitivity: dict[int, Array]
     offset: Array  # of Method 3
     s_rel_pct: dict[int, Array]  # (3,) of the main sensitivities, the largest value of the repetitions
@@ -61,7 +61,7 @@ class Comparison:
         return {m: rel_s_pct(self.sensitivity[m]) for m in (1, 3)}
 
 
-def compare(device: Device, runs: Sequence[Run], priors: Priors) -> Comparison:
+def compare(device: Device, runs: Sequence[SineRun], priors: Priors) -> Comparison:
     """Apply Methods 1 and 2 to amplitudes and Method 3 as printed, each with its uncertainty budget."""
     by_method = {m: [r for r in runs if _method(r) == m] for m in METHODS}
     one = method1.solve(by_method[1], priors)
@@ -87,7 +87,7 @@ def compare(device: Device, runs: Sequence[Run], priors: Priors) -> Comparison:
     )
 
 
-def window(run: Run) -> Window:
+def window(run: SineRun) -> Window:
     """A run as a window of Method 3, each cycle a segment; a_ref(t) is the sine fit of the LDV's velocity (Eq. 12)."""
     fit = four_parameter(run.time_s, run.reference)
     u, du = fit.derivative(run.time_s, 1), fit.derivative(run.time_s, 2)
@@ -97,7 +97,7 @@ def window(run: Run) -> Window:
     return Window(float(run.time_s[0]), float(run.time_s[-1]), run.pose, sums, True, "", points, 0)
 
 
-def _method(run: Run) -> int:
+def _method(run: SineRun) -> int:
     return 1 if run.pose.position.startswith("axis") else int(run.pose.position.split()[1].rstrip(","))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.model import Array
-from calib.paper.amplitudes import Run
+from calib.paper.amplitudes import SineRun
 from paper_reproduced.bench import Device
 from paper_reproduced.comparison import MAIN, METHODS, Comparison
 from paper_reproduced.published import REPEATABILITY_PCT, corrected_pct
@@ -46,7 +46,7 @@ def save(figure: Figure, path: Path) -> None:
         figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None, dpi=110)
 
 
-def figure_2(run: Run, a_ref_mps2: Array, unit: str) -> Figure:
+def figure_2(run: SineRun, a_ref_mps2: Array, unit: str) -> Figure:
     """Outputs and reference inputs over one period, Eqs. (9)-(11)."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 3.6), layout="constrained")

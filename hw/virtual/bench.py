@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.virtual.motion import ComplexArray
-from hw.virtual.noise import BLOCK, ColouredNoise, Stream, generator
+from hw.virtual.noise import BLOCK, ColouredNoise, NoiseStream, generator
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
 from hw.virtual.response import lowpass
 from hw.virtual.scene import Scene
@@ -40,7 +40,7 @@ class Truth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recording:
+class BenchRecording:
     """What a gateway would have recorded, and the truth. Stamps and times in s of the bench's clock."""
 
     sensor_stamp_s: Array  # (N,) when the gateway received the sample
@@ -137,14 +137,14 @@ class Bench:
         """Indications (n, m) of the reference, m/s2 or m/s."""
         return _cut(self._reference_block, first, n)
 
-    def recording(self, duration_s: float) -> Recording:
+    def recording(self, duration_s: float) -> BenchRecording:
         """Everything that a gateway receives from time 0 to `duration_s`. Poses: those whose hold ends by then."""
         p = self.parameters
-        sensor_stamp = self._stamps(p.sensor.clock, p.sensor.bursts, Stream.SENSOR_ARRIVAL, duration_s)
-        reference_stamp = self._stamps(p.reference.clock, p.reference.bursts, Stream.REFERENCE_ARRIVAL, duration_s)
+        sensor_stamp = self._stamps(p.sensor.clock, p.sensor.bursts, NoiseStream.SENSOR_ARRIVAL, duration_s)
+        reference_stamp = self._stamps(p.reference.clock, p.reference.bursts, NoiseStream.REFERENCE_ARRIVAL, duration_s)
         n, m = len(sensor_stamp), len(reference_stamp)
         sensor_time = self.sensor_times(0, n)
-        return Recording(
+        return BenchRecording(
             sensor_stamp_s=sensor_stamp,
             sensor_time_s=sensor_time,
             v=self.sensor_values(0, n),
@@ -156,7 +156,7 @@ class Bench:
             truth=self.truth,
         )
 
-    def _stamps(self, clock: Clock, bursts: Bursts | None, stream: Stream, until_s: float) -> Array:
+    def _stamps(self, clock: Clock, bursts: Bursts | None, stream: NoiseStream, until_s: float) -> Array:
         if bursts is None:
             return clock.times(0, int(clock.due(until_s)))
         return bursts.stamps(clock, bursts.arrivals(self.seed, stream, until_s))
@@ -174,7 +174,7 @@ class Bench:
         v *= 1 + sensor.sensitivity_per_k * warmer
         added = sensor.offset_per_k_mps2 * warmer + self._window_offsets(t)
         if sensor.noise_mps2:
-            added += sensor.noise_mps2 * generator(self.seed, Stream.SENSOR, block).normal(size=(BLOCK, 3))
+            added += sensor.noise_mps2 * generator(self.seed, NoiseStream.SENSOR, block).normal(size=(BLOCK, 3))
         if self._coloured is not None:
             added += sensor.coloured_noise_mps2 * self._coloured.block(block)
         v += sensor.offset + sensor.nominal_sensitivity * added
@@ -188,7 +188,7 @@ class Bench:
             if sensor.offset_by_position_mps2 is not None:
                 offset[span.part] += sensor.offset_by_position_mps2[self._scene.position_of(span.window)]
             if sensor.offset_by_window_mps2:
-                draw = generator(self.seed, Stream.WINDOW_OFFSET, span.window).normal(size=3)
+                draw = generator(self.seed, NoiseStream.WINDOW_OFFSET, span.window).normal(size=3)
                 offset[span.part] += sensor.offset_by_window_mps2 * draw
         return offset
 
@@ -197,7 +197,7 @@ class Bench:
         t = self.reference_times(block * BLOCK, BLOCK)
         values = reference.sensitivity * self._reference_input(reference, t - reference.lag_s)
         if reference.noise:
-            values += reference.noise * generator(self.seed, Stream.REFERENCE, block).normal(size=values.shape)
+            values += reference.noise * generator(self.seed, NoiseStream.REFERENCE, block).normal(size=values.shape)
         return _quantised(values, reference.resolution)
 
     def _reference_input(self, reference: ReferenceParameters, t_s: Array) -> Array:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
-from hw.virtual.building_motion import Band, BuildingMotion, ComplexArray
+from hw.virtual.building_motion import BuildingMotion, BuildingSpectrum, ComplexArray
 from hw.virtual.harm import HARMLESS, Harm, Role, Visit
-from hw.virtual.noise import Stream, generator
+from hw.virtual.noise import NoiseStream, generator
 from hw.virtual.response import Response
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
 from hw.virtual.timebase import Bursts, Clock
@@ -25,15 +25,15 @@ DAY_S = 86_400.0
 YEAR_S = 365.0 * DAY_S
 EPOCH_NS = 1_790_000_000_000_000_000  # UTC at time 0 of the building
 TEMPERATURE_STEP_K = 1 / 16  # resolution of the thermometer in a common chip
-STREAMS: dict[Role, tuple[Stream, Stream]] = {
-    "sensor": (Stream.SENSOR, Stream.SENSOR_ARRIVAL),
-    "reference": (Stream.REFERENCE, Stream.REFERENCE_ARRIVAL),
-    "check": (Stream.CHECK_REFERENCE, Stream.CHECK_REFERENCE_ARRIVAL),
+STREAMS: dict[Role, tuple[NoiseStream, NoiseStream]] = {
+    "sensor": (NoiseStream.SENSOR, NoiseStream.SENSOR_ARRIVAL),
+    "reference": (NoiseStream.REFERENCE, NoiseStream.REFERENCE_ARRIVAL),
+    "check": (NoiseStream.CHECK_REFERENCE, NoiseStream.CHECK_REFERENCE_ARRIVAL),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Instrument:
+class BuildingDevice:
     """One of the devices: its clock and its white noise.
 
     It sends its samples in bursts of `burst`. `late` gives the delay of a burst after its newest sample. `response` is
@@ -85,7 +85,7 @@ class BuildingParameters:
     window_s: float = 120.0
     every_s: float = 3600.0  # from the start of one visit to the start of the next; 0: visits without a pause
     level_mps2: tuple[float, float] = (0.02, 0.3)  # rms, drawn log-uniformly for each visit
-    band: Band = field(default_factory=Band)
+    band: BuildingSpectrum = field(default_factory=BuildingSpectrum)
     elsewhere: float = 0.0
     all_axes: bool = False
     across: tuple[complex, complex] = (0.0, 0.0)
@@ -101,15 +101,15 @@ class BuildingParameters:
     tilt_rad_a_day: Array = field(default_factory=lambda: np.zeros(3))
     weather: Weather = field(default_factory=Weather)
     reference_sensitivity: Array = field(default_factory=lambda: np.eye(3))  # (3, 3) applied to a_ref
-    sensor: Instrument = field(
-        default_factory=lambda: Instrument(0.005, Clock(200.0, rate_error=1e-4, offset_s=0.0013, wander=20e-6))
+    sensor: BuildingDevice = field(
+        default_factory=lambda: BuildingDevice(0.005, Clock(200.0, rate_error=1e-4, offset_s=0.0013, wander=20e-6))
     )
-    reference: Instrument = field(
-        default_factory=lambda: Instrument(
+    reference: BuildingDevice = field(
+        default_factory=lambda: BuildingDevice(
             0.001, Clock(200.0, rate_error=-0.6e-4, offset_s=0.0004, wander=10e-6, wander_period_s=2700.0)
         )
     )
-    check: Instrument | None = None  # a second reference
+    check: BuildingDevice | None = None  # a second reference
     check_sensitivity: Array = field(default_factory=lambda: np.eye(3))  # as `reference_sensitivity`, of the second
     reference_steps: tuple[
         tuple[Role, float, float], ...
@@ -157,9 +157,9 @@ class Building:
             for role, instrument in self._instruments().items()
         }  # fmt: skip
 
-    def _instruments(self) -> dict[Role, Instrument]:
+    def _instruments(self) -> dict[Role, BuildingDevice]:
         p = self.parameters
-        devices: dict[Role, Instrument | None] = {"sensor": p.sensor, "reference": p.reference, "check": p.check}
+        devices: dict[Role, BuildingDevice | None] = {"sensor": p.sensor, "reference": p.reference, "check": p.check}
         return {role: instrument for role, instrument in devices.items() if instrument is not None}
 
     def span(self, visit: int) -> tuple[float, float]:
@@ -190,21 +190,21 @@ class Building:
     def level_mps2(self, visit: int) -> float:
         """Level of the motion in a visit, rms."""
         low, high = np.log(self.parameters.level_mps2)
-        return float(np.exp(generator(self.seed, Stream.BUILDING_MOTION, visit).uniform(low, high)))
+        return float(np.exp(generator(self.seed, NoiseStream.BUILDING_MOTION, visit).uniform(low, high)))
 
     def visit(self, visit: int) -> list[SampleBlock]:
         """All blocks of a visit, of all devices, in order of arrival."""
         harm = self.harm if visit >= self.harmed_from else HARMLESS
-        elsewhere = self._motion(visit, Stream.BUILDING_HARM)
+        elsewhere = self._motion(visit, NoiseStream.BUILDING_HARM)
         motions: dict[Response | None, BuildingMotion] = {}
         blocks: list[SampleBlock] = []
         for role, instrument in self._instruments().items():
             if instrument.response not in motions:
-                motions[instrument.response] = self._motion(visit, Stream.BUILDING_MOTION, instrument.response)
+                motions[instrument.response] = self._motion(visit, NoiseStream.BUILDING_MOTION, instrument.response)
             blocks += self._device(role, visit, harm, motions[instrument.response], elsewhere)
         return sorted(blocks, key=lambda block: block.t_monotonic_ns)
 
-    def _motion(self, visit: int, stream: Stream, response: Response | None = None) -> BuildingMotion:
+    def _motion(self, visit: int, stream: NoiseStream, response: Response | None = None) -> BuildingMotion:
         p = self.parameters
         random = generator(self.seed, stream, visit)
         level = float(np.exp(random.uniform(*np.log(p.level_mps2))))

@@ -16,7 +16,7 @@ POINTS_A_PERIOD = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
+class BuildingSpectrum:
     """Spectrum of a building's motion: modes (natural frequency and damping ratio) above a flat part."""
 
     low_hz: float = 0.5
@@ -47,7 +47,7 @@ class BuildingMotion:
     def __init__(
         self,
         random: np.random.Generator,
-        band: Band,
+        band: BuildingSpectrum,
         start_s: float,
         stop_s: float,
         level_mps2: float,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hw.virtual.noise import Stream
+from hw.virtual.noise import NoiseStream
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, Schedule, Stand, clamped, resting, rotation
 
 
@@ -42,7 +42,7 @@ class ByHand(Schedule):
 
     def _misplaced(self, stand: Stand) -> Stand:
         place = np.rint(1000.0 * (stand.frame + 1.0)).astype(int).ravel().tolist()
-        random = np.random.default_rng([self.seed, Stream.PRESET, *place])
+        random = np.random.default_rng([self.seed, NoiseStream.PRESET, *place])
         if stand.theta_deg is not None and stand.alpha_deg is not None:
             alpha_deg = stand.alpha_deg + self.alpha_deg * random.normal()
             return clamped(stand.theta_deg + self.theta_deg, alpha_deg, np.inf, stand.level)

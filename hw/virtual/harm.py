@@ -16,7 +16,7 @@ ComplexArray = NDArray[np.complex128]
 Role = Literal["sensor", "reference", "check"]
 
 
-class Motion(Protocol):
+class MotionOverTime(Protocol):
     """Acceleration as a function of time."""
 
     def at(self, time_s: Array) -> Array: ...
@@ -32,7 +32,7 @@ class Visit:
     role: Role
     time_s: Array
     level_mps2: float
-    elsewhere: Motion
+    elsewhere: MotionOverTime
     random: np.random.Generator
     first: bool
 

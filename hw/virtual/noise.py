@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 BLOCK = 2048  # samples per block: 2 s at 1 kHz, long enough to make the fixed cost of a block small
 
 
-class Stream(IntEnum):
+class NoiseStream(IntEnum):
     """Purpose of a random number."""
 
     SENSOR = 1
@@ -29,7 +29,7 @@ class Stream(IntEnum):
     CHECK_REFERENCE_ARRIVAL = 13
 
 
-def generator(seed: int, stream: Stream, block: int = 0) -> np.random.Generator:
+def generator(seed: int, stream: NoiseStream, block: int = 0) -> np.random.Generator:
     """The generator of one block: Philox with seed and stream as its key and the block in the high word of its counter.
 
     Raises ValueError if the seed is not an unsigned 64-bit number.
@@ -66,10 +66,10 @@ class ColouredNoise:
         return self._advance()
 
     def _start(self) -> Array:
-        return np.asarray(generator(self._seed, Stream.SENSOR_COLOURED_START).normal(size=3))
+        return np.asarray(generator(self._seed, NoiseStream.SENSOR_COLOURED_START).normal(size=3))
 
     def _advance(self) -> Array:
-        white = generator(self._seed, Stream.SENSOR_COLOURED, self._next).normal(size=(BLOCK // 32, 32, 3))
+        white = generator(self._seed, NoiseStream.SENSOR_COLOURED, self._next).normal(size=(BLOCK // 32, 32, 3))
         values = self._kernel @ white
         for part in values:
             part += self._decay * self._state

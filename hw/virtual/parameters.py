@@ -109,7 +109,7 @@ class Knocks:
 
 
 @dataclass(frozen=True, slots=True)
-class Temperature:
+class TemperatureSwing:
     """Slow change of the sensor's temperature, mean + swing * sin; the sensor's S and Q hold at `mean_degc`."""
 
     mean_degc: float = 25.0
@@ -141,5 +141,5 @@ class BenchParameters:
     clamp: ClampErrors = field(default_factory=ClampErrors)
     knocks: Knocks = field(default_factory=Knocks)
     slip: Slip | None = None
-    temperature: Temperature = field(default_factory=Temperature)
+    temperature: TemperatureSwing = field(default_factory=TemperatureSwing)
     handling_mps2: float = 0.5  # amplitude of the vibration while a person turns the clamp

@@ -10,13 +10,13 @@ import numpy as np
 
 from hw.virtual.hand import ByHand
 from hw.virtual.motion import multisine
-from hw.virtual.noise import Stream, generator
+from hw.virtual.noise import NoiseStream, generator
 from hw.virtual.parameters import (
     BenchParameters,
     Knocks,
     ReferenceParameters,
     SensorParameters,
-    Temperature,
+    TemperatureSwing,
 )
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, Schedule, clamped, resting
 from hw.virtual.spread import Spread, drawn
@@ -48,7 +48,7 @@ def plain(seed: int) -> BenchParameters:
     mg). Both, and the phases of the motion, follow from `seed`. The rate of the ADXL355 is off by 0.33 % (measured on
     such parts: 12 s per hour). Reference: uniaxial accelerometer on the slide, 1 kHz, in m/s2, its clock off by 40 ppm.
     """
-    random = generator(seed, Stream.PRESET)
+    random = generator(seed, NoiseStream.PRESET)
     main = np.diag(1 + random.uniform(-0.04, 0.04, 3))
     transverse = random.uniform(-0.015, 0.015, (3, 3)) * (1 - np.eye(3))
     offset = random.uniform(0.1, 0.5, 3) * random.choice([-1.0, 1.0], 3)
@@ -105,9 +105,9 @@ def faulty(seed: int) -> BenchParameters:
         bench,
         sensor=sensor,
         knocks=Knocks(rate_hz=0.5, peak_mps2=8.0),
-        temperature=Temperature(swing_k=5.0, period_s=1800.0),
+        temperature=TemperatureSwing(swing_k=5.0, period_s=1800.0),
     )
-    return drawn(bench, spread, np.random.default_rng([seed, Stream.PRESET]))
+    return drawn(bench, spread, np.random.default_rng([seed, NoiseStream.PRESET]))
 
 
 def by_hand(kind: Literal["clamp", "triad", "gravity"], seed: int) -> BenchParameters:
@@ -119,7 +119,7 @@ def by_hand(kind: Literal["clamp", "triad", "gravity"], seed: int) -> BenchParam
     - "gravity": the sensor rests on the faces of its housing, known to 0.2 deg; offsets differ by 2.5 mm/s2.
     """
     bench = plain(seed)
-    random = np.random.default_rng([seed, Stream.PRESET])
+    random = np.random.default_rng([seed, NoiseStream.PRESET])
     on_clamp = kind == "clamp"
     schedule = ByHand(
         (clamped(THETA_DEG, ALPHAS_DEG[0], np.inf) if on_clamp else resting(np.array([0.0, 0.0, 1.0]), np.inf),),
@@ -155,7 +155,7 @@ def guided(seed: int) -> BenchParameters:
     stands = tuple(clamped(theta, alpha, HOLD_S) for theta, alpha in GUIDED_DEG)
     bench = replace(bench, schedule=replace(bench.schedule, stands=stands))
     spread = Spread(angle_deg=0.2, theta_deg=0.2, offset_mps2=0.05)
-    return drawn(bench, spread, np.random.default_rng([seed, Stream.PRESET]))
+    return drawn(bench, spread, np.random.default_rng([seed, NoiseStream.PRESET]))
 
 
 PRESETS: dict[str, Callable[[int], BenchParameters]] = {"plain": plain, "faulty": faulty, "guided": guided}

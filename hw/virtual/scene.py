@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hw.virtual.hand import ByHand
 from hw.virtual.motion import ComplexArray
-from hw.virtual.noise import Stream, generator
+from hw.virtual.noise import NoiseStream, generator
 from hw.virtual.parameters import BenchParameters
 from hw.virtual.schedule import Schedule, Span, Stand, clamp_frame, rotation
 
@@ -110,7 +110,7 @@ class Scene:
         knocks = self._p.knocks
         first = int((t_s[0] - knocks.duration_s) // KNOCK_CELL_S)
         for cell in range(max(first, 0), int(t_s[-1] // KNOCK_CELL_S) + 1):
-            random = generator(self._seed, Stream.KNOCK, cell)
+            random = generator(self._seed, NoiseStream.KNOCK, cell)
             for _ in range(random.poisson(knocks.rate_hz * KNOCK_CELL_S)):
                 start = (cell + random.random()) * KNOCK_CELL_S
                 blow = random.normal(size=3)

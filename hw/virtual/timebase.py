@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hw.sensor import GOLDEN
-from hw.virtual.noise import BLOCK, Stream, generator
+from hw.virtual.noise import BLOCK, NoiseStream, generator
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -80,7 +80,7 @@ class Bursts:
     # Stamps count back from a burst's arrival at the nominal rate; otherwise all samples of a burst have one stamp
     spread: bool = False
 
-    def arrivals(self, seed: int, stream: Stream, until_s: float) -> Array:
+    def arrivals(self, seed: int, stream: NoiseStream, until_s: float) -> Array:
         """Arrival times (B,) of the reads up to `until_s`; they never decrease."""
         reads = int(until_s / self.poll_s)
         late = np.concatenate([self._lateness(seed, stream, block) for block in range(reads // BLOCK + 1)])
@@ -98,7 +98,7 @@ class Bursts:
             stamps -= (np.repeat(due, count) - 1 - np.arange(due[-1] if len(due) else 0)) / clock.nominal_rate_hz
         return stamps
 
-    def _lateness(self, seed: int, stream: Stream, block: int) -> Array:
+    def _lateness(self, seed: int, stream: NoiseStream, block: int) -> Array:
         random = generator(seed, stream, block)
         late = self.least_late_s + random.exponential(self.mean_late_s, BLOCK)
         stalled = random.random(BLOCK) < self.stall_probability

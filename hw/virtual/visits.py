@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.virtual.building_motion import Band, BuildingMotion
-from hw.virtual.noise import BLOCK, Stream, generator
+from hw.virtual.building_motion import BuildingMotion, BuildingSpectrum
+from hw.virtual.noise import BLOCK, NoiseStream, generator
 from hw.virtual.response import Response
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
 from hw.virtual.serial_port import PtyDevice, SampleLines
@@ -61,7 +61,7 @@ class StructureParameters:
     u_offset_mps2: float = 0.05
     u_turned_deg: float = 0.0  # of every clamping, about each axis
     u_reference: float = 0.0  # of the reference's sensitivity
-    band: Band = field(default_factory=Band)
+    band: BuildingSpectrum = field(default_factory=BuildingSpectrum)
 
 
 class Structure:
@@ -69,7 +69,7 @@ class Structure:
 
     def __init__(self, parameters: StructureParameters, seed: int, way: Clamped = WELL) -> None:
         self.parameters, self.seed = parameters, seed
-        random, p = generator(seed, Stream.PRESET), parameters
+        random, p = generator(seed, NoiseStream.PRESET), parameters
         main, n = np.eye(3, dtype=bool), parameters.sensors
         self.sensitivity = np.eye(3) + np.where(main, p.u_main, p.u_transverse) * random.standard_normal((n, 3, 3))
         self.offset = p.u_offset_mps2 * random.standard_normal((n, 3))
@@ -117,7 +117,7 @@ class Structure:
     def _motion(self, sensor: int, loose: bool) -> BuildingMotion:
         key = (sensor, loose)
         if key not in self._moves:
-            random = generator(self.seed, Stream.BUILDING_MOTION, sensor)
+            random = generator(self.seed, NoiseStream.BUILDING_MOTION, sensor)
             response: Response | None = _on_a_spring if loose else None
             p = self.parameters
             self._moves[key] = BuildingMotion(random, p.band, 0.0, PERIOD_S, p.level_mps2, np.eye(3), response=response)
@@ -127,7 +127,7 @@ class Structure:
         """White noise (n, 3) with SD 1, which does not depend on the order of the calls."""
         blocks = range(first // BLOCK, (first + n - 1) // BLOCK + 1)
         seed = self.seed + (device << 32)
-        values = np.vstack([generator(seed, Stream.SENSOR, block).standard_normal((BLOCK, 3)) for block in blocks])
+        values = np.vstack([generator(seed, NoiseStream.SENSOR, block).standard_normal((BLOCK, 3)) for block in blocks])
         return values[first - blocks[0] * BLOCK :][:n]
 
 

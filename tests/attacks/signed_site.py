@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from agent.core.events import Result
 from agent.delivery.consumer import Consumer, Received
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from agent.recording.result_signing import ResultSigner
@@ -41,10 +41,10 @@ def signer_of(gateway: str, epoch: str, key: Ed25519PrivateKey | None) -> Result
     return signer
 
 
-def signed_record(result: Result, signer: ResultSigner, epoch: str) -> Record:
+def signed_record(result: Result, signer: ResultSigner, epoch: str) -> StoredResult:
     """As the agent makes it of a result of event 7."""
     signed = signer.signed(7, result)
-    return Record.of(result, recorded=True, recording="f", epoch=epoch, signed=signed.data if signed else b"")
+    return StoredResult.of(result, recorded=True, recording="f", epoch=epoch, signed=signed.data if signed else b"")
 
 
 class Gateway:
@@ -57,7 +57,7 @@ class Gateway:
         self.publisher = Publisher("site", name, [site.endpoint], self.store)
         self.publisher.start()
 
-    def make(self, **changes: Any) -> Record:
+    def make(self, **changes: Any) -> StoredResult:
         """The next calibration."""
         result = msgspec.structs.replace(calibration(self.store.last_sequence() + 1), **changes)
         return signed_record(result, self.signer, self.store.epoch)

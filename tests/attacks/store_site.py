@@ -21,7 +21,7 @@ from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import pack, unpack
 from agent.delivery.gateway_key import GatewayKey
-from agent.delivery.history import FILE_NAME, Record
+from agent.delivery.history import FILE_NAME, StoredResult
 from agent.delivery.schema import row_crc
 from agent.delivery.store import Store
 from agent.recording.files import final_name
@@ -109,7 +109,7 @@ class Run:
         name = final_name(path) if recorded and path is not None else ""
         signed = [self.recorder.results.signed(number, result) for result in outputs]
         records = [
-            Record.of(r, recorded=recorded, recording=name, epoch=self.store.epoch, signed=s.data if s else b"")
+            StoredResult.of(r, recorded=recorded, recording=name, epoch=self.store.epoch, signed=s.data if s else b"")
             for r, s in zip(outputs, signed, strict=True)
         ]
         if records:

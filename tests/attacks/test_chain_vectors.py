@@ -13,11 +13,13 @@ from agent.recording.head import Head
 from agent.recording.result_signing import SignedResult
 from agent.recording.results_chain import ResultsChain
 from agent.recording.signed_text import key_id, sign
-from agent.recording.signing import Statement
+from agent.recording.signing import SignedStatement
 from tests.attacks.chain_site import KEY
 
 PAGE = (Path(__file__).parents[2] / "docs" / "audit.md").read_text("utf-8")
-RECORDING = Statement("workshop/gateway-1", "00c0ffee00c0ffee", 7, "11" * 32, "4711 " + "22" * 32, 123456, "33" * 32)
+RECORDING = SignedStatement(
+    "workshop/gateway-1", "00c0ffee00c0ffee", 7, "11" * 32, "4711 " + "22" * 32, 123456, "33" * 32
+)
 HEAD = Head(RECORDING, "4096 " + "44" * 32, closed=False, utc_ns=1_790_000_000_000_000_000)
 
 

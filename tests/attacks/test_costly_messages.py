@@ -13,7 +13,7 @@ import zenoh
 from agent.delivery import holding
 from agent.delivery.answers import NOTHING
 from agent.delivery.consumer import Consumer
-from agent.delivery.holding import AT_ONCE, GATEWAYS_MAX, RESULTS_MAX, Held
+from agent.delivery.holding import AT_ONCE, GATEWAYS_MAX, RESULTS_MAX, WaitingResults
 from agent.delivery.received import Received, receive
 from tests.attacks.chain_site import KEY
 from tests.attacks.signed_site import PLACE, Gateway, listed, signed_record, signer_of, taken
@@ -30,7 +30,7 @@ def received(gateway: str, sequence: int) -> Received:
 
 
 def test_gateways_that_do_not_exist_take_a_bounded_place() -> None:
-    held = Held()
+    held = WaitingResults()
     for number in range(GATEWAYS_MAX + 300):
         held.add(received(f"gw-{number}", 7))
     assert held.dropped == {"": 300}
@@ -44,7 +44,7 @@ def test_gateways_that_do_not_exist_take_a_bounded_place() -> None:
 
 
 def test_results_of_one_gateway_take_a_bounded_place() -> None:
-    held = Held()
+    held = WaitingResults()
     for number in range(RESULTS_MAX + 30):
         held.add(received("gw", 5000 - number))
     assert held.dropped == {"site/gw": 30}
@@ -52,7 +52,7 @@ def test_results_of_one_gateway_take_a_bounded_place() -> None:
 
 
 def test_a_gateway_that_never_answered_is_asked_less_and_less_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_s, held, asked = [0.0], Held(), []
+    now_s, held, asked = [0.0], WaitingResults(), []
     monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
     held.add(received("gw", 7))
     while now_s[0] < 100.0:

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import Given, audit_files, run_audit
+from agent.cli.audit import GivenFiles, audit_files, run_audit
 from agent.core.events import CalibrationUpdate, Output, Result, RunStart, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.engine import identity
@@ -79,10 +79,10 @@ def test_a_statistic_set_to_its_threshold_does_not_pass(
     tmp_path: Path, change: Callable[[WindowReport], WindowReport], strict: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = record_again(tmp_path / "again", record_run(tmp_path), forged(change))
-    assert run_audit(Given([path]), Engines(StandIn.restore), as_json=False, strict=strict) == 3
+    assert run_audit(GivenFiles([path]), Engines(StandIn.restore), as_json=False, strict=strict) == 3
     told = capsys.readouterr().out
     assert "passed" not in told
-    [file] = audit_files(Given([path]), Engines(StandIn.restore))
+    [file] = audit_files(GivenFiles([path]), Engines(StandIn.restore))
     assert file.replay.undecidable == 0
     assert file.replay.different > 1, "the calibrations after it are compared too"
     assert file.reasons[0].startswith("the results do not follow from the data")
@@ -107,7 +107,7 @@ def test_no_window_of_the_real_pipeline_is_on_the_edge_by_its_counts(tmp_path: P
         )  # fmt: skip
         recorded.append((step.event_sequence, event[0], results))
     path = record_again(tmp_path / "again", recorded, forged(change))
-    [file] = audit_files(Given([path]), Engines(Pipeline.restore))
+    [file] = audit_files(GivenFiles([path]), Engines(Pipeline.restore))
     assert file.replay.undecidable == 0, file.replay.notes
     assert file.replay.different == 4, "each of the forged calibrations is compared"
     assert file.reasons[0].startswith("the results do not follow from the data")
@@ -133,10 +133,10 @@ def test_a_decision_on_the_edge_is_not_passed(tmp_path: Path, capsys: pytest.Cap
 
     path = record_again(tmp_path / "again", record_run(tmp_path), forged(below))
     for strict in (False, True):
-        assert run_audit(Given([path]), Engines(JustAbove.restore), as_json=False, strict=strict) == 3
+        assert run_audit(GivenFiles([path]), Engines(JustAbove.restore), as_json=False, strict=strict) == 3
         told = capsys.readouterr().out
         assert "passed" not in told
         assert "not decided: a decision is so close" in told
-    assert run_audit(Given([path]), Engines(JustAbove.restore), as_json=True) == 3
+    assert run_audit(GivenFiles([path]), Engines(JustAbove.restore), as_json=True) == 3
     verdict = json.loads(capsys.readouterr().out)
     assert (verdict["ok"], verdict["undecidable"]) == (False, 1)

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from tests.attacks.hostile_bus import HostileGateway, messages, payloads, put_all
@@ -43,7 +43,7 @@ class Sender:
     def next(self) -> int:
         return self.store.last_sequence() + 1
 
-    def send(self, *records: Record) -> None:
+    def send(self, *records: StoredResult) -> None:
         self.store.commit(records)
         for each in records:
             self.publisher.publish(each)

@@ -15,7 +15,7 @@ from agent.config.key_file import KeyFileError
 from agent.config.known_keys import WatchedKeys, read_known_keys, revoke_key
 from agent.delivery import answers, verifying
 from agent.delivery.consumer import Consumer
-from agent.delivery.history import History, Record
+from agent.delivery.history import History, StoredResult
 from agent.delivery.received import receive
 from agent.delivery.verifying import UnverifiedError, Verifier
 from tests.attacks.chain_site import KEY
@@ -220,7 +220,7 @@ def test_unsigned_results_of_the_past_do_not_hide_the_signed_ones(
 
 def test_changed_bytes_are_never_verified(tmp_path: Path) -> None:
     epoch = "00c0ffee00c0ffee"
-    record: Record = signed_record(calibration(7), signer_of("site/gw", epoch, KEY), epoch)
+    record: StoredResult = signed_record(calibration(7), signer_of("site/gw", epoch, KEY), epoch)
     verifier = Verifier(WatchedKeys(listed(tmp_path / "known.keys", KEY)))
     assert receive(PLACE, record.payload, b"6\n" + record.signed, verifier) is not None
     draw = random.Random(14)

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from agent.cli.show import show
 from agent.core.events import CalibrationUpdate, Result
-from agent.delivery.history import FILE_NAME, History, Record
+from agent.delivery.history import FILE_NAME, History, StoredResult
 from agent.delivery.schema import StoreError, row_crc
 from tests.attacks.chain_site import KEY, public_pem
 from tests.attacks.signed_site import OTHER
@@ -39,7 +39,7 @@ def said(result: Result) -> bytes:
     return msgspec.json.encode(result)
 
 
-def in_force(data: Path) -> Record | None:
+def in_force(data: Path) -> StoredResult | None:
     with History(data / FILE_NAME) as history:
         return history.in_force("s")
 

@@ -18,13 +18,13 @@ from agent.cli import probe
 from agent.cli.audit import describe as describe_audit
 from agent.cli.main import run_cli
 from agent.core.events import StatusChange
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.store import Store
 from agent.terminal.console import TextConsole
-from agent.terminal.screen import Picture
+from agent.terminal.screen import ScreenPicture
 from agent.terminal.state import DeviceState, ViewState
 from agent.terminal.text import figure_text, one_line, page_text, visible
-from agent.terminal.view import Lines
+from agent.terminal.view import LineView
 from tests.scenarios.processes import ROOT
 from tests.unit.results import calibration, status
 
@@ -80,7 +80,7 @@ def test_rich_draws_only_its_own_control_sequences(monkeypatch: pytest.MonkeyPat
     state.statuses = {HOSTILE: hostile}
     state.say(HOSTILE)
     console = TextConsole(stream, width=200)
-    console.print(Picture(state))
+    console.print(ScreenPicture(state))
     console.print("[link=http://x]no markup[/link] :warning:")
     without_colours = re.sub(r"\x1b\[[0-9;]*m", "", stream.text)
     assert "\x1b[" in stream.text
@@ -94,7 +94,7 @@ def _fields(result: Any) -> dict[str, Any]:
 
 def test_the_lines_of_a_run_are_lines(capsys: pytest.CaptureFixture[str]) -> None:
     state = ViewState(title="t", gateway="g")
-    view = Lines(state, sys.stdout)
+    view = LineView(state, sys.stdout)
     state.devices = {"mems": DeviceState(kind=HOSTILE)}
     state.say(HOSTILE)
     view.refresh()
@@ -132,7 +132,7 @@ def test_whatever_the_program_prints_is_guarded(tmp_path: Path) -> None:
     """The real program, on a terminal: a store that somebody else wrote, and a file name that is hostile."""
     store = Store(tmp_path, 0)
     results = [calibration(1), StatusChange(**{**_fields(status(2)), "reason": HOSTILE})]
-    store.commit([Record.of(r, recorded=True, recording="") for r in results])
+    store.commit([StoredResult.of(r, recorded=True, recording="") for r in results])
     store.close()
     mine, its = pty.openpty()
     command = [sys.executable, "-m", "agent", "show", "--data-dir", str(tmp_path)]

@@ -12,7 +12,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from agent.recording.head import Head
-from agent.recording.signing import Signer, Statement
+from agent.recording.signing import SignedStatement, Signer
 from agent.recording.witness import DAY_NS, GATEWAYS_MAX, PROOFS_MAX, HeadFile, Witness
 from tests.attacks.chain_site import KEY, known
 
@@ -32,7 +32,7 @@ def head(
     digests = [
         hashlib.sha256(f"{part} {number} {history}".encode()).hexdigest() for part in ("begin", f"{length}{content}")
     ]
-    statement = Statement(gateway, epoch, number, "", "1 " + "0" * 64, length, digests[1])
+    statement = SignedStatement(gateway, epoch, number, "", "1 " + "0" * 64, length, digests[1])
     return Signer(key).sign(Head(statement, f"100 {digests[0]}", closed, utc_ns).text).json
 
 

@@ -8,7 +8,7 @@ import time
 from itertools import pairwise
 from pathlib import Path
 
-from agent.delivery.history import FILE_NAME, Record
+from agent.delivery.history import FILE_NAME, StoredResult
 from tests.faults.acquisition import LONGEST_S, acquisition
 from tests.faults.invariants import Ledger, read_store
 from tests.faults.outcome import Outcome
@@ -94,6 +94,6 @@ def step_clock(path: Path, seconds: int) -> None:
         file.write(struct.pack("q", seconds * 10**9))
 
 
-def _rising(records: list[Record], before: list[Record]) -> bool:
+def _rising(records: list[StoredResult], before: list[StoredResult]) -> bool:
     later = [record for record in records if record.run_id != before[0].run_id]
     return bool(later) and min(record.sequence for record in later) > max(record.sequence for record in before)

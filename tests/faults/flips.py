@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.delivery.store import Store
 from agent.recording.integrity import check_integrity
 from agent.recording.messages import encode
@@ -108,7 +108,7 @@ def _recorded(directory: Path, seconds: float, size_bytes: int = 0) -> Path:
         return r.data_dir
 
 
-def _start(data_dir: Path, right: list[Record], in_force: Record) -> str:
+def _start(data_dir: Path, right: list[StoredResult], in_force: StoredResult) -> str:
     """What a start does with a state file; "silently wrong" where it uses changed values without noticing."""
     try:
         store = Store(data_dir)
@@ -208,5 +208,5 @@ def _begun(data_dir: Path, before: list[object]) -> str:
     return "began without a calibration"
 
 
-def _calibration(record: Record) -> list[object]:
+def _calibration(record: StoredResult) -> list[object]:
     return [record.fields[name] for name in ("sensitivity", "offset", "covariance", "identity")]

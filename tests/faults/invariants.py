@@ -16,7 +16,7 @@ from agent.audit.replaying import Replayer
 from agent.core.events import CalibrationUpdate
 from agent.core.pipeline import Pipeline
 from agent.delivery.consumer import Received
-from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.delivery.store import Store
 from agent.recording.fingerprint import fingerprint
 from agent.recording.reading import RecordingReader
@@ -63,7 +63,7 @@ class Ledger:
         self._lost: set[int] = set()
         self._aside: set[Path] = set()
         self._replayed: dict[str, int] = {}
-        self.records: list[Record] = []
+        self.records: list[StoredResult] = []
 
     def inspect(self, witnessed: Iterable[Received] = ()) -> None:
         """Inspect the store and the new recordings. No agent may be running."""
@@ -117,7 +117,7 @@ class Ledger:
                     self.findings.say(f"calibration {record.sequence} begins a run and is not {before.sequence}")
             before = update
 
-    def _judge(self, records: list[Record]) -> None:
+    def _judge(self, records: list[StoredResult]) -> None:
         for record in records:
             if record.what != "calibration":
                 continue
@@ -151,7 +151,7 @@ class Ledger:
                 found.say(f"{name}: {len(missing)} results that were flushed are not in it, first {min(missing)}")
 
 
-def read_store(data_dir: Path) -> list[Record]:
+def read_store(data_dir: Path) -> list[StoredResult]:
     """Read all results of a store, from a copy, so that the next start finds the files exactly as the fault left them.
 
     Raises StoreError, also where the file would be set aside as corrupt.

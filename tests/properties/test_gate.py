@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agent.config.gate import GateSettings
-from agent.core.gate import Answer, Decision, Evidence, Gate
+from agent.core.gate import CommandEffect, Decision, Evidence, Gate
 from agent.core.snapshot import pack, unpack
 from calib.model import Calibration
 from tests.gate_rules import NOMINAL, calibration, consistent, jumped, within_max_change
@@ -57,7 +57,7 @@ class Site:
         self.published: list[int] = []
         self.in_force: Calibration | None = None
 
-    def step(self, step: Step) -> Decision | Answer:
+    def step(self, step: Step) -> Decision | CommandEffect:
         """One event; `ago` counts proposals back from the newest."""
         kind, candidate, confirmed, ago = step
         if kind in ("lost", "back"):
@@ -73,7 +73,7 @@ class Site:
             self.in_force = candidate if decision.action == "take" else confirmed
         return decision
 
-    def _command(self, kind: str, earlier: Calibration, waiting: list[int]) -> Answer:
+    def _command(self, kind: str, earlier: Calibration, waiting: list[int]) -> CommandEffect:
         if kind == "accept":
             return self.gate.accept(waiting[0] if waiting else 0, "key")
         if kind == "rollback":
@@ -90,7 +90,7 @@ def test_nothing_goes_beyond_max_change_without_an_operator(
     fixed = True  # the anchor of the test's own rule: known to within max_change
     for step in steps_:
         outcome = site.step(step)
-        if isinstance(outcome, Answer) and outcome.calibration is not None:
+        if isinstance(outcome, CommandEffect) and outcome.calibration is not None:
             anchor = outcome.calibration
             fixed = bool(anchor.standard_uncertainty[0] <= 0.02)
         if isinstance(outcome, Decision) and outcome.in_force:
@@ -142,7 +142,7 @@ def _table() -> Iterator[tuple[str, str, str]]:
 TABLE = set(_table())
 
 
-def _seen(step: Step, outcome: Decision | Answer) -> str:
+def _seen(step: Step, outcome: Decision | CommandEffect) -> str:
     if isinstance(outcome, Decision):
         return outcome.action
     return f"command {step[0]}" if step[0] in COMMANDS else f"sensor {step[0]}"
@@ -186,7 +186,7 @@ def _walk(site: Site, steps: Iterable[Step]) -> set[tuple[str, str, str]]:
             continue
         outcome = site.step(step)
         assert outcome.status == site.gate.status
-        if isinstance(outcome, Answer) and outcome.refused:
+        if isinstance(outcome, CommandEffect) and outcome.refused:
             assert outcome.status == before
         else:
             met.add((_seen(step, outcome), before, outcome.status))

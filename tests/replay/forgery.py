@@ -13,15 +13,15 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from agent.recording.limits import Budget
+from agent.recording.limits import UsedLimits
 from agent.recording.messages import schema_data, schema_of
-from agent.recording.records import MAGIC, ChunkMessage, Record, content, parse, unpack, walk
+from agent.recording.records import MAGIC, ChunkMessage, FileRecord, content, parse, unpack, walk
 from agent.recording.signing import SIGNATURE_METADATA
 
 Message = tuple[str, str, int, int, int, bytes]  # topic, schema, log time, publish time, sequence, data
 
 
-def records(data: bytes) -> list[Record]:
+def records(data: bytes) -> list[FileRecord]:
     """All records of a file, which must be readable to its end."""
     return list(walk(io.BytesIO(data), len(data)))
 
@@ -46,7 +46,7 @@ class Unpacked:
     @staticmethod
     def of(path: Path) -> Unpacked:
         """Read a file of this program."""
-        found, budget = Unpacked(), Budget()
+        found, budget = Unpacked(), UsedLimits()
         schemas: dict[int, str] = {}
         channels: dict[int, tuple[str, str]] = {}
         with open(path, "rb") as file:

@@ -30,7 +30,7 @@ from benchmarks.online.clamp import blocks
 from benchmarks.online.runner import ticked
 from deploy.engines.earlier import NoHistoryError, build
 from hw.block import SampleBlock
-from hw.virtual.noise import Stream
+from hw.virtual.noise import NoiseStream
 from hw.virtual.timebase import Clock
 from tests import golden_site
 from tests.unit.recorded_bench import EPOCH_NS, record_events
@@ -84,18 +84,18 @@ def make(directory: Path) -> None:
 
 def _events() -> Iterator[Event]:
     """Openings, then the blocks of both devices and the ticks in order of time."""
-    streams = {golden_site.SENSOR: Stream.SENSOR_ARRIVAL, golden_site.REFERENCE: Stream.REFERENCE_ARRIVAL}
+    streams = {golden_site.SENSOR: NoiseStream.SENSOR_ARRIVAL, golden_site.REFERENCE: NoiseStream.REFERENCE_ARRIVAL}
     for device in streams:
         info = json.dumps(msgspec.to_builtins(golden_site.info(device)))
         yield DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=info)
     streams = [
-        _blocks(golden_site.SENSOR, Stream.SENSOR_ARRIVAL),
-        _blocks(golden_site.REFERENCE, Stream.REFERENCE_ARRIVAL),
+        _blocks(golden_site.SENSOR, NoiseStream.SENSOR_ARRIVAL),
+        _blocks(golden_site.REFERENCE, NoiseStream.REFERENCE_ARRIVAL),
     ]
     yield from ticked(heapq.merge(*streams, key=lambda block: block.t_monotonic_ns))
 
 
-def _blocks(device: str, stream: Stream) -> Iterator[SampleBlock]:
+def _blocks(device: str, stream: NoiseStream) -> Iterator[SampleBlock]:
     rate_hz, late = golden_site.RATE_HZ, golden_site.LATE
     stamp_s = late.stamps(Clock(rate_hz), late.arrivals(SEED, stream, DURATION_S))
     return blocks(device, stamp_s, golden_site.World(SEED).values(device, 0, len(stamp_s)), rate_hz)

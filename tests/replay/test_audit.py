@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import Given, audit_files, recordings_of, run_audit
+from agent.cli.audit import GivenFiles, audit_files, recordings_of, run_audit
 from agent.core.events import RunStart
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import recordings
@@ -47,7 +47,7 @@ def test_sound_recordings_pass(files: list[Path], capsys: pytest.CaptureFixture[
 
 
 def test_json_is_one_object(files: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_audit(Given(files), Engines(StandIn.restore), as_json=True) == 0
+    assert run_audit(GivenFiles(files), Engines(StandIn.restore), as_json=True) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["ok"], said["undecidable"]) == (True, 0)
     assert [file["size"] for file in said["files"]] == [path.stat().st_size for path in files]
@@ -71,7 +71,7 @@ def test_an_unfinished_file_is_incomplete(files: list[Path], capsys: pytest.Capt
     files[0].write_bytes(whole[:5000])
     status, said = audit(files, capsys)
     assert status == 3
-    first = audit_files(Given(files), Engines(StandIn.restore))[0]
+    first = audit_files(GivenFiles(files), Engines(StandIn.restore))[0]
     assert first.incomplete
     assert f"incomplete, last good byte {first.good_bytes}: byte" in said
     assert said.count("FAILED") == 1  # the next file passes
@@ -83,7 +83,7 @@ def test_a_replaced_file_breaks_the_chain(files: list[Path], tmp_path: Path) -> 
     other.mkdir()
     record_run(other, blocks=12, rotate_at=(9, 20), seed=2)
     (other / files[1].name).rename(files[1])
-    first, second, third = audit_files(Given(files), Engines(StandIn.restore))
+    first, second, third = audit_files(GivenFiles(files), Engines(StandIn.restore))
     assert first.ok
     assert "the results do not follow from the data: event 9, snapshot" in second.reasons[0]
     assert any("SHA-256 differs" in reason for reason in third.reasons)
@@ -94,7 +94,7 @@ def test_a_file_number_that_was_changed_is_found_though_the_sums_fit(files: list
     at = data.index(b"file_sequence") + len(b"file_sequence") + 4
     assert data[at : at + 1] == b"1"
     files[0].write_bytes(with_sums(data[:at] + b"7" + data[at + 1 :]))
-    (file,) = audit_files(Given(files[:1]), Engines(StandIn.restore))
+    (file,) = audit_files(GivenFiles(files[:1]), Engines(StandIn.restore))
     assert file.reasons == ["its metadata says file number 7, its RunStart 1"]
 
 
@@ -126,8 +126,8 @@ def test_other_files_fail(tmp_path: Path, content: bytes, capsys: pytest.Capture
 
 
 def test_a_file_that_cannot_be_read_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_audit(Given([tmp_path / "gone.mcap"]), Engines(StandIn.restore), as_json=False) == 2
-    assert run_audit(Given([tmp_path]), Engines(StandIn.restore), as_json=False) == 2
+    assert run_audit(GivenFiles([tmp_path / "gone.mcap"]), Engines(StandIn.restore), as_json=False) == 2
+    assert run_audit(GivenFiles([tmp_path]), Engines(StandIn.restore), as_json=False) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.splitlines() == [
@@ -144,7 +144,7 @@ def test_another_fingerprint_is_compared_within_the_tolerance(tmp_path: Path) ->
         return number, event, results
 
     path = record_again(tmp_path / "again", record_run(tmp_path), elsewhere)
-    (file,) = audit_files(Given([path]), Engines(StandIn.restore))
+    (file,) = audit_files(GivenFiles([path]), Engines(StandIn.restore))
     assert file.ok
     assert file.replay.tolerance == OTHER_CPU
     assert file.notes
@@ -160,13 +160,13 @@ AUDIT = """
 import sys
 from pathlib import Path
 from agent.audit.engines import Engines
-from agent.cli.audit import Given, run_audit
+from agent.cli.audit import GivenFiles, run_audit
 from agent.recording.fingerprint import compute_as
 from agent.recording.reading import first_event
 from tests.replay.stand_in import StandIn
 path = Path(sys.argv[1])
 compute_as(first_event(path).fingerprint)
-sys.exit(run_audit(Given([path]), Engines(StandIn.restore), as_json=True))
+sys.exit(run_audit(GivenFiles([path]), Engines(StandIn.restore), as_json=True))
 """
 
 

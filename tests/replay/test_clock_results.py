@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import Given, run_audit
+from agent.cli.audit import GivenFiles, run_audit
 from agent.core.events import ClockReport, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import FILE_NAME, History
@@ -34,7 +34,7 @@ def entries(run: Path) -> list[Recorded]:
 
 
 def audit(path: Path) -> int:
-    return run_audit(Given([path]), Engines(Pipeline.restore), as_json=False)
+    return run_audit(GivenFiles([path]), Engines(Pipeline.restore), as_json=False)
 
 
 def test_clock_results_are_recorded_stored_and_follow_from_the_data(

@@ -22,13 +22,13 @@ import zenoh
 
 from agent.commanding.network import serve_queries
 from agent.core.events import Acceleration, Estimate
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.keys import gateway_key
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from agent.fleet.simulated import SimulatedFleet, behaviours
 from agent.fleet.simulated_sensor import Behaviour
-from agent.monitor.settings import Plan
+from agent.monitor.settings import FloorPlan
 from agent.recording.acceleration import encode_acceleration
 from tests.unit.browser import Watched, chromium
 from tests.unit.command_desk import GATEWAY, DeskSite
@@ -110,11 +110,11 @@ class CommandedGateway:
         known = {"response": RESPONSE, "reference_frequency_hz": 5.0, "reference_temperature_degc": 21.0,
                  "temperature_low_degc": 15.0, "temperature_high_degc": 30.0, "references": ["B12 4711"]}  # fmt: skip
         self.publish([record(first, "calibration", **known),
-                      Record.of(estimate, recorded=True, recording="f.mcap", epoch=""),
+                      StoredResult.of(estimate, recorded=True, recording="f.mcap", epoch=""),
                       record(first + 2, "clock")])  # fmt: skip
         return first + 1
 
-    def publish(self, records: Sequence[Record]) -> None:
+    def publish(self, records: Sequence[StoredResult]) -> None:
         """Keep results and publish them."""
         self._store.commit(records)
         for each in records:
@@ -248,7 +248,7 @@ def look_at_views(directory: Path) -> int:
     positions = {f"simulated/gw000{k}/s0": (0.1 + 0.1 * k, 0.5) for k in range(8)}
     with ExitStack() as opened:
         data = Path(opened.enter_context(tempfile.TemporaryDirectory()))
-        plan = Plan(picture=IMAGES / "report.png", positions=positions)
+        plan = FloorPlan(picture=IMAGES / "report.png", positions=positions)
         shown = opened.enter_context(page_site(site, data, plan=plan))
         gateway = Streaming(site, data / "streaming")
         opened.callback(gateway.close)

@@ -16,7 +16,7 @@ from agent.acquisition.service import Service
 from agent.config import parse_config
 from agent.core.events import DeviceChange, Gap
 from agent.recording.reading import RecordingReader
-from agent.terminal.watch import Watch
+from agent.terminal.watch import RunView
 from hw.block import SampleBlock
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.kernel import I2CBus, installed
@@ -155,7 +155,7 @@ def test_a_wrong_chip_is_named_and_does_not_stop_the_agent(tmp_path: Path, capsy
     nothing = np.empty((0, 3), dtype=np.int32)
     identity = bytes([0xAD, 0x1D, 0xE5, 0x01])
     twin = Adxl355Twin(lambda _first, _n: nothing, lambda _t_s: 0, time.monotonic, identity=identity)
-    with installed({"/dev/i2c-1": I2CBus({0x1D: twin})}), Watch(config, "test", None) as watch:
+    with installed({"/dev/i2c-1": I2CBus({0x1D: twin})}), RunView(config, "test", None) as watch:
         service = Service(config, tmp_path, watch)
         runner = threading.Thread(target=service.run, args=(None,))
         runner.start()

@@ -26,7 +26,7 @@ pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 pytest.importorskip("argon2", reason="the extra monitor is not installed")
 pytest.importorskip("axe_playwright_python", reason="axe is not installed")
 from agent.fleet.simulated_sensor import BEGINS, Behaviour
-from agent.monitor.settings import Plan
+from agent.monitor.settings import FloorPlan
 from agent.monitor.users import set_user
 from tests.scenarios.fleet_page import IMAGES, CommandedGateway, PageSite, ask, axe_faults, page_site
 from tests.unit.monitor_site import Monitor, Served
@@ -84,7 +84,7 @@ def assert_the_five_questions_are_answered(shown: PageSite, page: Any) -> None:
 
 def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_path: Path, browser: Any) -> None:
     places = {f"simulated/gw000{k}/s0": (0.1 + 0.1 * k, 0.5) for k in range(8)}
-    plan = Plan(picture=PICTURE, positions=places)
+    plan = FloorPlan(picture=PICTURE, positions=places)
     with page_site(site, tmp_path, plan=plan) as shown:
         stepped = f"{shown.fleet.names_of('stepped')[0]} / s0"
         shown.rounds(6)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.store import Store
 from tests.scenarios.processes import ROOT, fieldcal, interrupt, started, wait_until
 from tests.unit.results import calibration, status
@@ -35,7 +35,7 @@ def test_a_configuration_without_end_is_bad_input() -> None:
 
 def filled(data_dir: Path) -> Path:
     store = Store(data_dir, 0)
-    store.commit([Record.of(r, recorded=True, recording="") for r in (calibration(1), status(2))])
+    store.commit([StoredResult.of(r, recorded=True, recording="") for r in (calibration(1), status(2))])
     store.close()
     return data_dir
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from agent.acquisition.service import Service
 from agent.config import parse_config
-from agent.terminal.watch import Watch
+from agent.terminal.watch import RunView
 from tests.scenarios.processes import ROOT, wait_until
 from tests.unit.recorded_bench import record
 
@@ -68,7 +68,7 @@ def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> N
         "test",
     )
     assert len(gc.get_objects()) > 4 * FEW
-    with Watch(config, "test", None) as watch:
+    with RunView(config, "test", None) as watch:
         service = Service(config, tmp_path / "data", watch)
         runner = threading.Thread(target=service.run, args=(None,))
         runner.start()

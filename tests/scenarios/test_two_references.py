@@ -14,7 +14,7 @@ from benchmarks.online import references
 from benchmarks.online.config import building_config
 from benchmarks.online.node import Timing
 from benchmarks.online.runner import opened, tick, ticked
-from hw.virtual.building import Building, BuildingParameters, Instrument
+from hw.virtual.building import Building, BuildingDevice, BuildingParameters
 from hw.virtual.timebase import Clock
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # the second reference stands turned by 90 deg
@@ -32,7 +32,7 @@ VISITS = 8
 def site() -> Building:
     parameters = BuildingParameters(
         window_s=20.0, every_s=60.0, all_axes=True, level_mps2=(0.1, 0.3), sensitivity=np.diag([1.01, 0.99, 1.02]),
-        check=Instrument(0.001, Clock(200.0, rate_error=0.5e-4, offset_s=0.0007)), check_sensitivity=QUARTER.T,
+        check=BuildingDevice(0.001, Clock(200.0, rate_error=0.5e-4, offset_s=0.0007)), check_sensitivity=QUARTER.T,
     )  # fmt: skip
     return Building(parameters, 7)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from agent.certificate.making import as_object, certificate_of
-from agent.certificate.statements import Statements
+from agent.certificate.statements import CertificateStatements
 from agent.cli.main import run_cli
 from agent.config.reading import load_model
 from agent.report.material import gather
@@ -62,6 +62,6 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int
 def content(inputs: Sequence[Path], path: Path) -> dict[str, Any]:
     """What certificate.json would hold, without drawing."""
     material = gather(inputs, None)
-    found = certificate_of(material, load_model(path, Statements), path.parent, left_over(material))
+    found = certificate_of(material, load_model(path, CertificateStatements), path.parent, left_over(material))
     held: dict[str, Any] = json.loads(msgspec.json.encode(as_object(found)))
     return held

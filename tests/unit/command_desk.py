@@ -15,7 +15,7 @@ from agent.commanding.desk import Answer, CommandDesk
 from agent.commanding.envelope import Order, seal
 from agent.config import Commands
 from agent.core.events import Command
-from agent.delivery.history import FILE_NAME, History, Record
+from agent.delivery.history import FILE_NAME, History, StoredResult
 from agent.delivery.store import Store
 from tests.unit.zenoh_site import record
 
@@ -45,7 +45,7 @@ class DeskSite:
             made.commit([record(101, "calibration"), record(102, "window")])
             made.close()
 
-        def find(sensor: str, what: str, sequence: int) -> Record | None:
+        def find(sensor: str, what: str, sequence: int) -> StoredResult | None:
             with History(store) as history:
                 found = history.after(sequence - 1, [(sensor, what)], limit=1)
             return found[0] if found and found[0].sequence == sequence else None

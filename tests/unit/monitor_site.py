@@ -27,7 +27,7 @@ from agent.monitor.login import Access
 from agent.monitor.plan import Plans
 from agent.monitor.running import Web, web_server
 from agent.monitor.server import application
-from agent.monitor.settings import Plan
+from agent.monitor.settings import FloorPlan
 from tests.unit.zenoh_site import Site, wait_for
 
 STARTS_S = 30.0
@@ -55,7 +55,7 @@ class Served(AbstractContextManager["Served"]):
 
     def __init__(
         self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None,
-        plan: Plan | None = None, *, behind_proxy: bool = False, **more: Any,
+        plan: FloorPlan | None = None, *, behind_proxy: bool = False, **more: Any,
     ) -> None:  # fmt: skip
         self._open = ExitStack()
         directory.mkdir(exist_ok=True)

@@ -12,7 +12,7 @@ from agent.config import Config, parse_config
 from agent.core.events import CalibrationUpdate, Command, DeviceChange, Result, StatusChange, Tick, WindowReport
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 from tests.building_windows import GRAVITY
 from tests.clamp_windows import Q_TRUE, S_TRUE
@@ -139,7 +139,7 @@ def _motion(t: np.ndarray) -> np.ndarray:
 
 def _json(calibration: CalibrationUpdate | None) -> str:
     """As the store has it."""
-    return Record.of(calibration, recorded=False, recording="").payload.decode() if calibration else ""
+    return StoredResult.of(calibration, recorded=False, recording="").payload.decode() if calibration else ""
 
 
 def begun(config: Config, **more: Any) -> Site:

@@ -14,7 +14,7 @@ from agent import __version__
 from agent.config import Config, parse_config
 from agent.core.events import DeviceChange, Event, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.store import Store
 from agent.engine import identity
 from agent.recording.fingerprint import fingerprint, versions
@@ -30,7 +30,7 @@ PRIOR = {"sensitivity": COUNTS_PER_MPS2}
 
 
 def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-1", **channel: Any) -> Truth:
-    """Record the plain preset's first `duration_s` into a data directory with store and one recording."""
+    """StoredResult the plain preset's first `duration_s` into a data directory with store and one recording."""
     bench = Bench(plain(seed), seed)
     record_events(data_dir, _config(bench, **channel), _events(bench, duration_s), run_id)
     return bench.truth
@@ -58,7 +58,7 @@ def record_events(
         results = pipeline.step(event)
         assert recorder.record(number, event, results)
         kept = [r for r in results if isinstance(r, Result)]
-        store.commit([Record.of(r, recorded=True, recording=name) for r in kept], pipeline.memories(results))
+        store.commit([StoredResult.of(r, recorded=True, recording=name) for r in kept], pipeline.memories(results))
     recorder.close()
     store.close()
 

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from agent.cli.calibrate import calibrate
-from hw.virtual.bench import Bench, Recording
+from hw.virtual.bench import Bench, BenchRecording
 from hw.virtual.motion import multisine
 from hw.virtual.parameters import BenchParameters, ReferenceParameters, SensorParameters
 from hw.virtual.schedule import Schedule, clamped
@@ -43,7 +43,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _files(folder: Path, recording: Recording) -> None:
+def _files(folder: Path, recording: BenchRecording) -> None:
     _write(folder / "sensor.csv", "time_s,vx,vy,vz", recording.sensor_stamp_s, recording.v)
     _write(folder / "reference.csv", "time_s,a", recording.reference_stamp_s, recording.reference)
     lines = [f"{p.start_s},{p.stop_s},{p.theta_deg},{p.alpha_deg}" for p in recording.poses]

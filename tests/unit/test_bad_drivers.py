@@ -24,7 +24,7 @@ from agent.core.events import DeviceChange, Event, Gap
 from agent.core.pipeline import Pipeline
 from agent.recording.reading import RecordingReader
 from agent.setup import device_checks
-from agent.terminal.watch import Watch
+from agent.terminal.watch import RunView
 from hw.block import BlockFlags, SampleBlock
 from tests.scenarios.processes import ROOT, fieldcal, recordings, wait_until
 from tests.unit.buggy_driver import BUGS, IN_BLOCKS, NOT_FIRST, install
@@ -81,7 +81,7 @@ class Run:
 def run(config: Config, data_dir: Path, enough: Callable[[Run], bool], timeout_s: float = 60.0) -> Run:
     """Run the agent on these devices until `enough`, at most `timeout_s`."""
     found = Run(data_dir)
-    with Watch(config, "test", None) as watch:
+    with RunView(config, "test", None) as watch:
         service = Service(config, data_dir, watch)
 
         def guarded() -> None:

@@ -18,7 +18,7 @@ from hw.virtual.parameters import (
     Knocks,
     ReferenceParameters,
     SensorParameters,
-    Temperature,
+    TemperatureSwing,
 )
 from hw.virtual.scene import Scene
 from hw.virtual.schedule import Schedule, clamped, directed, resting
@@ -194,7 +194,7 @@ def test_saturation_and_quantisation() -> None:
 
 
 def test_temperature_moves_q_and_s() -> None:
-    warm = Temperature(mean_degc=20.0, swing_k=5.0, period_s=40.0)
+    warm = TemperatureSwing(mean_degc=20.0, swing_k=5.0, period_s=40.0)
     sensor = SensorParameters(
         offset_per_k_mps2=(0.01, 0.02, -0.03), sensitivity_per_k=1e-3, offset=np.array([1.0, 1.0, 1.0])
     )

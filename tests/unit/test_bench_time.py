@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from hw.virtual.bench import Bench
-from hw.virtual.noise import Stream
+from hw.virtual.noise import NoiseStream
 from hw.virtual.parameters import BenchParameters, SensorParameters
 from hw.virtual.timebase import Bursts, Clock
 
@@ -66,7 +66,7 @@ def test_stamps_are_late_arrivals_never_early() -> None:
 def test_spread_stamps_step_at_the_nominal_rate_within_a_burst() -> None:
     clock = Clock(500.0, rate_error=0.02)
     together = Bursts(poll_s=0.05)
-    arrivals = together.arrivals(3, Stream.SENSOR_ARRIVAL, 2.0)
+    arrivals = together.arrivals(3, NoiseStream.SENSOR_ARRIVAL, 2.0)
     at_once, spread = together.stamps(clock, arrivals), replace(together, spread=True).stamps(clock, arrivals)
     last = np.flatnonzero(np.diff(at_once, append=np.inf))
     assert_allclose(spread[last], at_once[last], rtol=0, atol=1e-12)
@@ -83,6 +83,6 @@ def test_without_bursts_stamps_are_true() -> None:
 
 def test_arrivals_do_not_depend_on_how_long_one_records() -> None:
     bursts = Bursts(stall_probability=0.3, longest_stall_s=0.1)
-    long, short = (bursts.arrivals(9, Stream.SENSOR_ARRIVAL, until) for until in (100.0, 50.0))
+    long, short = (bursts.arrivals(9, NoiseStream.SENSOR_ARRIVAL, until) for until in (100.0, 50.0))
     assert np.array_equal(short, long[: len(short)])
     assert len(short) > 3000

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hw.block import BlockFlags, SampleBlock
-from hw.virtual.building import DAY_S, Building, BuildingParameters, Instrument, Weather
-from hw.virtual.building_motion import Band, BuildingMotion
+from hw.virtual.building import DAY_S, Building, BuildingDevice, BuildingParameters, Weather
+from hw.virtual.building_motion import BuildingMotion, BuildingSpectrum
 from hw.virtual.harm import (
     Clipped,
     ClockStep,
@@ -37,7 +37,8 @@ def small(**changes: Any) -> BuildingParameters:
     """One minute of motion every ten minutes, at 100 Hz."""
     parameters = BuildingParameters(
         window_s=60.0, every_s=600.0, sensitivity=SENSITIVITY, offset=np.array([0.1, -0.2, 0.3]),
-        sensor=Instrument(0.005, Clock(100.0, 1e-4, 0.0013, 20e-6)), reference=Instrument(0.001, Clock(100.0, -6e-5)),
+        sensor=BuildingDevice(0.005, Clock(100.0, 1e-4, 0.0013, 20e-6)),
+        reference=BuildingDevice(0.001, Clock(100.0, -6e-5)),
     )  # fmt: skip
     return replace(parameters, **changes)
 
@@ -82,7 +83,7 @@ def test_any_visit_gives_the_same_bits_whatever_was_asked_before() -> None:
 
 def test_indications_are_the_truth_of_that_day() -> None:
     """Without noise and with one clock for both devices, V = S (R a_ref + g) + Q holds to rounding."""
-    quiet = Instrument(0.0, EXACT)
+    quiet = BuildingDevice(0.0, EXACT)
     turn = rotation(np.array([0.0, 0.6, 0.8]), 0.3)
     step = np.zeros((3, 3))
     step[1, 1] = 0.01
@@ -107,7 +108,7 @@ def test_indications_are_the_truth_of_that_day() -> None:
 
 
 def test_the_sensor_lags_and_moves_with_the_stated_level() -> None:
-    parameters = small(lag_s=0.02, sensor=Instrument(0.0, EXACT), reference=Instrument(0.0, EXACT))
+    parameters = small(lag_s=0.02, sensor=BuildingDevice(0.0, EXACT), reference=BuildingDevice(0.0, EXACT))
     building = Building(replace(parameters, sensitivity=np.eye(3), offset=np.zeros(3)), 3)
     blocks = building.visit(1)
     V, a = values(blocks, "sensor")[:, 1], values(blocks, "reference")[:, 1]
@@ -119,7 +120,7 @@ def test_the_sensor_lags_and_moves_with_the_stated_level() -> None:
 
 
 def test_some_visits_move_elsewhere() -> None:
-    building = Building(small(elsewhere=0.3, reference=Instrument(0.0, EXACT)), 4)
+    building = Building(small(elsewhere=0.3, reference=BuildingDevice(0.0, EXACT)), 4)
     elsewhere = 0
     for visit in range(40):
         spread = values(building.visit(visit), "reference").std(axis=0)
@@ -129,7 +130,7 @@ def test_some_visits_move_elsewhere() -> None:
 
 def test_motion_between_grid_points_is_the_band_limited_one() -> None:
     """A grid twice as fine gives the same motion: the cubic interpolation differs by 3e-6 of it."""
-    band = Band()
+    band = BuildingSpectrum()
     coarse = BuildingMotion(np.random.default_rng(1), band, 0.0, 20.0, 0.1, np.eye(3)[1:2])
     lines = np.fft.rfft(coarse._value[:, 0])
     fine = np.fft.irfft(lines, 4 * len(coarse._value)) * 4
@@ -213,7 +214,7 @@ def test_what_dies_is_silent_and_what_lives_is_untouched() -> None:
 
 
 def test_turned_swapped_and_far_away() -> None:
-    quiet: dict[str, Any] = {"sensor": Instrument(0.0, EXACT), "reference": Instrument(0.0, EXACT)}
+    quiet: dict[str, Any] = {"sensor": BuildingDevice(0.0, EXACT), "reference": BuildingDevice(0.0, EXACT)}
     order = np.eye(3)[[1, 0, 2]]
     whole, swapped = visited(Transformed("", "sensor", order), **quiet)
     assert np.array_equal(values(swapped, "sensor"), values(whole, "sensor")[:, [1, 0, 2]])
@@ -226,7 +227,7 @@ def test_turned_swapped_and_far_away() -> None:
 
 
 def test_an_imaginary_share_moves_a_quarter_of_a_period_ahead() -> None:
-    band = Band(3.9, 4.1, ((4.0, 0.001),), flat=0.0)
+    band = BuildingSpectrum(3.9, 4.1, ((4.0, 0.001),), flat=0.0)
     shape = np.array([[0.01j, 1.0, 0.02]])
     motion = BuildingMotion(np.random.default_rng(1), band, 0.0, 60.0, 0.1, shape)
     time_s = np.arange(5.0, 55.0, 0.01)
@@ -240,7 +241,7 @@ def test_filters_of_instruments_multiply_s_at_a_frequency() -> None:
     """A low-pass of first order at 10 Hz shows 0.707 of 10 Hz: in the sensor S is smaller by that, in the reference
     larger; what the building's devices indicate agrees."""
     parameters = small(
-        all_axes=True, offset=np.zeros(3), sensor=Instrument(0.0, EXACT), reference=Instrument(0.0, EXACT)
+        all_axes=True, offset=np.zeros(3), sensor=BuildingDevice(0.0, EXACT), reference=BuildingDevice(0.0, EXACT)
     )
     filtered = replace(parameters, sensor=replace(parameters.sensor, response=lowpass(1, 10.0)))
     undone = replace(parameters, reference=replace(parameters.reference, response=lowpass(1, 10.0)))

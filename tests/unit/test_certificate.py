@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from agent.certificate.making import certificate_of
 from agent.certificate.schema import SchemaError, check_schema
 from agent.certificate.signing import PURPOSE, signed_json
-from agent.certificate.statements import Statements
+from agent.certificate.statements import CertificateStatements
 from agent.certificate.wording import before_results
 from agent.cli.main import run_cli
 from agent.config.earlier import DCC, PARAMETER_LIST, SI, read_earlier
@@ -312,7 +312,7 @@ def test_s_that_rests_alone_tell_holds_at_0_hz(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     path.write_text(json.dumps(fields(reference_frequency_hz=0.0, valid_band_hz=None, response=None)))
     material, told = gather([path], None), stated(tmp_path)
-    made = certificate_of(material, load_model(told, Statements), told.parent, left_over(material))
+    made = certificate_of(material, load_model(told, CertificateStatements), told.parent, left_over(material))
     held = replace(made, frequency_hz=(7.8, 7.8))
     rows = [row for section in before_results(held, "") for row in section.rows]
     assert ("frequencies", "S at 0 Hz, as rests tell it") in rows

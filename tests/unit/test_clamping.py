@@ -15,7 +15,7 @@ from benchmarks.visits import Visit
 from calib.model import PARAMETERS, Calibration
 from calib.recorded.outcome import Outcome
 from calib.visit.clamping import Clamping, clamping
-from calib.visit.next_stop import Wanted
+from calib.visit.next_stop import WantedUncertainty
 from hw.virtual.visits import Clamped
 
 SECONDS = 30.0
@@ -76,12 +76,12 @@ def _outcome(type_a: float, reference: float) -> Outcome:
 
 def test_the_time_follows_from_the_budget():
     """The variance of noise falls with the inverse of the time; the reference stays, and forbids what is below it."""
-    wanted = Wanted(2.0 * np.hypot(0.003, 0.004 / 2.0), np.inf)  # a half of the noise: four times the time
+    wanted = WantedUncertainty(2.0 * np.hypot(0.003, 0.004 / 2.0), np.inf)  # a half of the noise: four times the time
     told = ahead(_outcome(0.004, 0.003), 30.0, wanted)
     assert told is not None
     assert told.now == pytest.approx(np.full(9, 0.01))
     assert told.needed_s == pytest.approx(120.0)
-    never = ahead(_outcome(0.004, 0.003), 30.0, Wanted(0.0059, np.inf))
+    never = ahead(_outcome(0.004, 0.003), 30.0, WantedUncertainty(0.0059, np.inf))
     assert never is not None
     assert np.isinf(never.needed_s)
     assert never.at_last == pytest.approx(np.full(9, 0.006))

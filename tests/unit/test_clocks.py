@@ -10,11 +10,11 @@ import pytest
 
 from agent.core.clocks import Clocks
 from agent.core.events import ClockReport, Event
-from agent.core.outcome import Source
+from agent.core.outcome import ResultSource
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import pack, unpack
 from agent.core.stream import DeviceStream
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from calib.distributions import chi2_quantile
 from hw.block import SampleBlock
 from tests.unit.test_pipeline import EPOCH_NS, SECOND, felt, lost, motion, opened, pipeline, tick
@@ -159,11 +159,11 @@ def test_sample_numbers_that_make_no_clock_are_no_fault() -> None:
         arrival = np.array([k * SECOND // 50], dtype=np.int64)
         stream.update(SampleBlock("s", "boot", 0, k % 2, 50.0, arrival, np.ones(1, np.int32), np.zeros((1, 3))))
     assert stream.clock() is None
-    assert Clocks().reports(Source("s", "", "", 0), 60.0, {"s": stream}, None) == []
+    assert Clocks().reports(ResultSource("s", "", "", 0), 60.0, {"s": stream}, None) == []
 
 
 def test_numbers_that_are_unknown_are_null_in_json() -> None:
     events = in_order(blocks("s", 101.3, 100.0, 62.0, np.zeros(6500)), [])
     [report] = clocks(pipeline(reference=True, rate_hz=100.0), events)
-    fields = json.loads(Record.of(report, recorded=True, recording="f").payload)
+    fields = json.loads(StoredResult.of(report, recorded=True, recording="f").payload)
     assert (fields["lag_s"], fields["u_lag_s"], fields["device"], fields["role"]) == (None, None, "s", "sensor")

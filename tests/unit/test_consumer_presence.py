@@ -16,7 +16,7 @@ import zenoh
 from agent.delivery import presence
 from agent.delivery.answers import answer_queries
 from agent.delivery.consumer import Consumer
-from agent.delivery.holding import AT_ONCE, LOOKS_MAX, Held
+from agent.delivery.holding import AT_ONCE, LOOKS_MAX, WaitingResults
 from agent.delivery.keys import presence_key
 from agent.delivery.presence import Presence
 from agent.delivery.store import Store
@@ -111,7 +111,7 @@ def test_tokens_of_gateways_that_do_not_exist_take_bounded_memory(site: Site, mo
 
 
 def test_gateways_that_are_looked_at_take_no_place_of_those_whose_results_wait() -> None:
-    held = Held()
+    held = WaitingResults()
     for k in range(LOOKS_MAX):
         assert held.room() == LOOKS_MAX - k
         held.look(f"site/gw{k}", known=True)

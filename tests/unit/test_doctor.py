@@ -18,7 +18,7 @@ import pytest
 from agent.cli.main import run_cli
 from agent.config import Config, parse_config
 from agent.core.events import ClockReport
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.store import Store
 from agent.setup import device_checks, machine_checks
 from agent.setup.contradictions import contradictions
@@ -187,8 +187,8 @@ def test_the_rates_that_a_running_agent_has_measured(tmp_path: Path, capsys: pyt
     path, data_dir = tmp_path / "gateway.toml", tmp_path / "data"
     assert run_cli(["init", str(path), "--sensor", "adxl355", "--no-reference"]) == 0
 
-    def clock(sequence: int, rate_hz: float) -> Record:
-        return Record.of(
+    def clock(sequence: int, rate_hz: float) -> StoredResult:
+        return StoredResult.of(
             ClockReport(
                 run_id="run", sequence=sequence, sensor="sensor", t_utc_ns=sequence, device="sensor", role="sensor",
                 nominal_rate_hz=1000.0, rate_hz=rate_hz, u_rate_hz=0.1, offset_s=0.0, u_offset_s=0.0, jitter_s=0.0,

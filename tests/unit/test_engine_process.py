@@ -15,7 +15,7 @@ from agent.core.events import RunStart
 from agent.core.pipeline import Pipeline
 from agent.engine import frames, sandbox
 from agent.engine.identity import ROOT
-from agent.engine.process import EngineError, EngineFaultError, EngineProcess, Limits
+from agent.engine.process import EngineError, EngineFaultError, EngineProcess, ProcessLimits
 from agent.engine.wheel import EngineWheel, build, read_wheel, wheel_of
 from agent.recording.messages import encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordingReader
@@ -45,7 +45,7 @@ def engine_that(does: str) -> EngineWheel:
     return read_wheel("a test", wheel_of(1, "0" * 16, sources))
 
 
-def begun(does: str, limits: Limits | None = None) -> str:
+def begun(does: str, limits: ProcessLimits | None = None) -> str:
     """What is told of an engine that does so."""
     with EngineProcess(engine_that(does), limits) as engine, pytest.raises((EngineError, EngineFaultError)) as told:
         engine.begin("fieldcal.v1.Event", b"")
@@ -135,7 +135,7 @@ def test_pipeline_that_raises_is_told_and_the_next_file_begins(process: EnginePr
 )  # fmt: skip
 def test_engine_that_does_more_than_to_compute_is_told(does: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FIELDCAL_SECRET", "x")
-    text = begun(does, Limits(step_s=20.0))
+    text = begun(does, ProcessLimits(step_s=20.0))
     assert re.search(told, text), text
     assert "SECRET" not in text
 
@@ -148,18 +148,18 @@ def test_thread_of_an_engine_is_allowed() -> None:
 @pytest.mark.parametrize(
     ("does", "limits", "told"),
     [
-        ("while True: pass", Limits(step_s=0.5), "it took more than 0.5 s for one event"),
+        ("while True: pass", ProcessLimits(step_s=0.5), "it took more than 0.5 s for one event"),
         # This engine takes no processor time, so that only the clock of this process can end it.
-        ("import time; time.sleep(60)", Limits(whole_s=1.0), "it took more than 1 s in all"),
-        ("while True: os.write(1, b'x' * 100)", Limits(step_s=5.0), "it breaks the format"),
+        ("import time; time.sleep(60)", ProcessLimits(whole_s=1.0), "it took more than 1 s in all"),
+        ("while True: os.write(1, b'x' * 100)", ProcessLimits(step_s=5.0), "it breaks the format"),
         (
             "import signal; signal.signal(signal.SIGXCPU, signal.SIG_IGN)\nwhile True: pass",
-            Limits(step_s=1.0),
+            ProcessLimits(step_s=1.0),
             "took more",
         ),
     ],
 )
-def test_engine_that_does_not_end_is_ended(does: str, limits: Limits, told: str) -> None:
+def test_engine_that_does_not_end_is_ended(does: str, limits: ProcessLimits, told: str) -> None:
     begin = time.monotonic()
     assert told in begun(does, limits)
     assert time.monotonic() - begin < 10
@@ -284,5 +284,5 @@ def test_size_of_memory_that_a_real_engine_needs(process: EngineProcess) -> None
     """The default limit leaves three quarters of the address space free."""
     status = Path(f"/proc/{process._process.pid}/status").read_text()
     peak_kb = int(status.split("VmPeak:")[1].split()[0])
-    assert peak_kb * 1024 < Limits().memory_bytes / 2
+    assert peak_kb * 1024 < ProcessLimits().memory_bytes / 2
     assert "Seccomp:\t2\n" in status

@@ -10,7 +10,7 @@ import pytest
 from calib.adjustment.adjustment import adjust
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.rows import Noise
+from calib.estimate.rows import NoiseScores
 from calib.estimate.statements import Statements, Step
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
@@ -167,7 +167,7 @@ def test_noise_that_correlates_is_pooled_over_windows_as_sums() -> None:
     of 12 segments cannot tell how neighbours correlate: ratios of single windows gave 8.9, and 0.70 of u of S_zx."""
     random = np.random.default_rng(5)
     windows = clamp_points(random, Faults(0.003, 0.001, {}, 0.02, 4e-4, 0.02, 0.9), repetitions=12).windows
-    noise = Noise.around([Record.of(window, 0.0) for window in windows])[-1]
+    noise = NoiseScores.around([Record.of(window, 0.0) for window in windows])[-1]
     # By 70 degrees of freedom a variance is known to 17 %. They are a third of the segments, joined in pairs.
     assert noise.means == pytest.approx(19.0, rel=0.3)
     assert 50.0 < noise.degrees_of_freedom < 100.0
@@ -183,7 +183,7 @@ def test_noise_is_pooled_over_windows_nearby() -> None:
     for phi in (0.0, 0.9):
         made = clamp_points(random, Faults(phi=phi), repetitions=12).windows
         records += [Record.of(window, 0.0) for window in made] * 20
-    noise = [own.means for own in Noise.around(records)]
+    noise = [own.means for own in NoiseScores.around(records)]
     assert noise[0] == pytest.approx(1.0, rel=0.3)  # by 160 degrees of freedom
     assert noise[-1] == pytest.approx(19.0, rel=0.3)
     assert noise[len(noise) // 2] == pytest.approx(10.0, rel=0.3)

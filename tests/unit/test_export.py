@@ -21,7 +21,7 @@ from agent.calibrate.tables import read_sensor
 from agent.cli.main import run_cli
 from agent.export import uff
 from agent.export.plots import write_plots
-from agent.export.samples import Content, ExportError, Samples, content_of, samples
+from agent.export.samples import ExportedSamples, ExportError, RecordedContent, content_of, samples
 from agent.export.tables import cell, write_csv
 from agent.export.uff import write_uff
 from agent.reading.ros2 import RosBag
@@ -127,11 +127,11 @@ def test_uff_has_each_signal_with_unit_direction_and_times(
         np.testing.assert_allclose(one["x"], times - times[0], atol=2e-4)  # the step has six digits
 
 
-def uff_blocks(*parts: tuple[int, int]) -> Iterator[Samples]:
+def uff_blocks(*parts: tuple[int, int]) -> Iterator[ExportedSamples]:
     """Blocks (number of the first sample, how many) of a steady device at 100 Hz, with a = its own number."""
     for first, count in parts:
         numbers = np.arange(first, first + count, dtype=float)
-        yield Samples(
+        yield ExportedSamples(
             (1_700_000_000 * 10**9 + numbers * 1e7).astype(np.int64), numbers[:, None], None, first, 100.0, None
         )
 
@@ -139,7 +139,7 @@ def uff_blocks(*parts: tuple[int, int]) -> Iterator[Samples]:
 def test_a_set_of_uff_spans_no_hole_and_no_name_breaks_its_lines(tmp_path: Path) -> None:
     pytest.importorskip("pyuff", reason="pyuff is not installed (extra uff)")
     path = tmp_path / "holes.uff"
-    content = Content("a" * 63, "m/s²\n    -1\n", 1)
+    content = RecordedContent("a" * 63, "m/s²\n    -1\n", 1)
     assert write_uff(path, content, uff_blocks((5, 3), (8, 2), (20, 1), (30, 4))) == 10
     assert [(numbers, float(head[6][30:43]), head[4].rstrip()) for head, numbers in uff_sets(path)] == [
         ([5.0, 6.0, 7.0, 8.0, 9.0], 0.0, "NONE"),
@@ -158,14 +158,14 @@ def test_what_uff_cannot_hold_is_refused(limit: str, tmp_path: Path, monkeypatch
     monkeypatch.setattr(uff, limit, 3)
     blocks = uff_blocks((0, 4)) if limit == "MOST_SAMPLES" else uff_blocks(*((10 * k, 1) for k in range(4)))
     with pytest.raises(ExportError, match="export fewer recordings at once, or to"):
-        write_uff(tmp_path / "a.uff", Content("a", "m/s2", 1), blocks)
+        write_uff(tmp_path / "a.uff", RecordedContent("a", "m/s2", 1), blocks)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_pyuff_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyuff", None)
     with pytest.raises(ExportError, match="fieldcal extras --install uff"):
-        write_uff(tmp_path / "a.uff", Content("a", "m/s2", 1), [])
+        write_uff(tmp_path / "a.uff", RecordedContent("a", "m/s2", 1), [])
 
 
 @pytest.mark.slow
@@ -335,7 +335,7 @@ def test_a_cell_is_no_formula(text: str) -> None:
 
 
 def test_the_unit_of_a_device_is_no_formula_in_a_header(tmp_path: Path) -> None:
-    write_csv(tmp_path / "a.csv", Content("a", '=cmd|"x",', 1), [])
+    write_csv(tmp_path / "a.csv", RecordedContent("a", '=cmd|"x",', 1), [])
     with (tmp_path / "a.csv").open(newline="") as file:
         assert next(csv.reader(file)) == ["time_s", 'indication_=cmd|"x",']
     assert cell("=cmd") == "'=cmd"
@@ -345,14 +345,14 @@ def test_the_unit_of_a_device_is_no_formula_in_a_header(tmp_path: Path) -> None:
 def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     """Three times as many blocks, both more than a chunk of MCAP: the same memory."""
 
-    def blocks(count: int, rows: int) -> Iterator[Samples]:
+    def blocks(count: int, rows: int) -> Iterator[ExportedSamples]:
         for k in range(count):
             times = EPOCH_NS + (np.arange(rows) + rows * k) * 100_000_000
-            yield Samples(times, np.zeros((rows, 3)), np.zeros((rows, 3)), rows * k, 10.0, None)
+            yield ExportedSamples(times, np.zeros((rows, 3)), np.zeros((rows, 3)), rows * k, 10.0, None)
 
     def peak(write: Callable[..., int], count: int, rows: int, *more: float) -> int:
         tracemalloc.start()
-        write(tmp_path / f"{write.__name__}{count}", Content("a", "count", 3), blocks(count, rows), *more)
+        write(tmp_path / f"{write.__name__}{count}", RecordedContent("a", "count", 3), blocks(count, rows), *more)
         top = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return top

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import Given, audit_files
+from agent.cli.audit import GivenFiles, audit_files
 from agent.recording.files import recordings
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
@@ -30,8 +30,8 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from agent.audit.engines import Engines
-from agent.cli.audit import Given, audit_files
-from agent.delivery.history import History, Record, StoreError
+from agent.cli.audit import GivenFiles, audit_files
+from agent.delivery.history import History, StoredResult, StoreError
 from agent.delivery.store import Store
 from agent.recording.files import recordings
 from agent.recording.writer import Recorder
@@ -50,7 +50,7 @@ def feed(event):
     recorded = recorder.record(number, event, results)
     number += 1
     if results:
-        records = [Record.of(r, recorded=recorded, recording="") for r in results]
+        records = [StoredResult.of(r, recorded=recorded, recording="") for r in results]
         said.extend((r.sequence, r.recorded) for r in records)
         try:
             store.commit(records)
@@ -96,7 +96,7 @@ store.close()
 with History(store.path) as history:
     history.check()
     kept = [(r.sequence, r.recorded) for r in history.after(0, limit=100_000)]
-audited = audit_files(Given([p for _, p in recordings(data)]), Engines(StandIn.restore))
+audited = audit_files(GivenFiles([p for _, p in recordings(data)]), Engines(StandIn.restore))
 print(json.dumps({"phases": phases, "said": said, "kept": kept, "files": len(audited),
                   "reasons": [reason for file in audited for reason in file.reasons]}))
 """
@@ -187,6 +187,6 @@ def test_a_sync_that_fails_gives_the_file_up_and_the_next_is_sound(
     assert min(lost) in failing
     assert max(lost) < min(failing) + 15, "ten seconds later the disk is tried again"
     assert [n for n, recorded in told if recorded and n > max(lost)]
-    files = audit_files(Given([path for _, path in recordings(tmp_path)]), Engines(StandIn.restore))
+    files = audit_files(GivenFiles([path for _, path in recordings(tmp_path)]), Engines(StandIn.restore))
     assert [file.reasons for file in files] == [[], []]
     assert [file.repaired for file in files] == [True, False]

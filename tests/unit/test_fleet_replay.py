@@ -23,7 +23,7 @@ from agent.core.anew import anew
 from agent.core.events import CalibrationUpdate, RunStart, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.fleet.results import Summary, results_of
-from agent.fleet.settings import Setting, SettingError
+from agent.fleet.settings import ChangedSetting, SettingError
 from agent.fleet.sources import SourceError, found, local
 from agent.fleet.task import Task, run_task
 from agent.fleet.workers import LocalWorkers, outcome
@@ -226,7 +226,7 @@ def test_a_wrong_setting_is_refused_with_its_path_before_any_file_is_read(text: 
     assert done.return_value == 2
     assert told in done.stderr
     with pytest.raises(SettingError):
-        Setting.of(text)
+        ChangedSetting.of(text)
 
 
 def test_a_setting_that_a_recording_cannot_have_refuses_that_recording(recordings: Path) -> None:

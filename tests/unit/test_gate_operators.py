@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agent.config.gate import DriftOptions, GateSettings
-from agent.core.gate import Answer, Gate
+from agent.core.gate import CommandEffect, Gate
 from agent.core.snapshot import pack, unpack
 from calib.drift.drift import DriftSettings
 from tests.gate_rules import (
@@ -82,7 +82,9 @@ def test_rolled_back_it_stays_so_until_released() -> None:
         (lambda g: g.rollback(calibration(NOMINAL * np.nan), "k"), "S and Q must be finite"),
     ],
 )
-def test_commands_without_sense_are_refused_and_change_nothing(command: Callable[[Gate], Answer], why: str) -> None:
+def test_commands_without_sense_are_refused_and_change_nothing(
+    command: Callable[[Gate], CommandEffect], why: str
+) -> None:
     g = valid()
     for number in (70, 71):
         g.judge(consistent(), FAR)

@@ -17,8 +17,8 @@ import pytest
 from agent.cli.main import run_cli
 from agent.config import load_config
 from agent.setup.buses import bus_clock_khz
-from agent.setup.listening import Heard, _Line, _understood, hear
-from agent.setup.toml import Setting, Table, written
+from agent.setup.listening import PortLines, _PortBytes, _understood, hear
+from agent.setup.toml import TomlSetting, TomlTable, written
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.kernel import I2CBus, installed
 from tests.scenarios.processes import answered
@@ -211,14 +211,14 @@ def test_questions_are_asked_on_a_terminal_only(tmp_path: Path) -> None:
 
 def test_a_stall_of_the_machine_does_not_change_the_rate() -> None:
     """100 Hz for 3 s. The lines of 0.3 s in the middle and of 0.3 s at the end come late, at once."""
-    listened = _Line(None, bytearray())  # type: ignore[arg-type]
+    listened = _PortBytes(None, bytearray())  # type: ignore[arg-type]
     for k in range(300):
         listened.data += b"%d,0.5\n" % (1000 + k)
         if not (120 <= k < 150 or 270 <= k < 299):
             listened.arrivals.append((0.01 * k, len(listened.data)))
     listened.arrivals[-1] = (2.99 + 0.3, len(listened.data))
     heard = _understood(listened, 115200)
-    assert isinstance(heard, Heard), heard
+    assert isinstance(heard, PortLines), heard
     assert heard.nominal_hz == 100
     assert heard.counted_hz == pytest.approx(100.0, rel=0.01)
 
@@ -285,6 +285,6 @@ def test_toml_is_what_tomllib_reads() -> None:
         "text": 'a "quoted" \\ \n \x7f ü', "flag": True, "number": 1, "small": 1e-300, "list": [1.5, 2.0],
         "table": {"a b": 1}, "tables": [{"x": 1}, {"x": 2}], "odd key!": "x",
     }  # fmt: skip
-    settings = [Setting(name, value, "what it is", "test") for name, value in values.items()]
-    text = written("title", [Table("[all]", [*settings, Setting("missing", None, "is left out", "test")])])
+    settings = [TomlSetting(name, value, "what it is", "test") for name, value in values.items()]
+    text = written("title", [TomlTable("[all]", [*settings, TomlSetting("missing", None, "is left out", "test")])])
     assert tomllib.loads(text) == {"all": values}

@@ -13,7 +13,7 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from agent.cli.main import run_cli
 from agent.config import load_config
-from agent.setup.listening import Heard, hear
+from agent.setup.listening import PortLines, hear
 from hw.block import BlockFlags, SampleBlock
 from hw.sensor import Sensor, load_driver
 from hw.serial_ports import lasting_name, serial_ports
@@ -208,7 +208,7 @@ def test_a_board_that_starts_when_its_port_is_opened() -> None:
     boot = b"ets Jun  8 2016 00:22:57\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13 (SPI_FAST_FLASH_BOOT)\r\n" * 35
     with writing(lambda k: f"{k},{REST}\r\n", greeting=boot) as port:
         heard = hear({port: 115200})[port]
-    assert isinstance(heard, Heard), heard
+    assert isinstance(heard, PortLines), heard
     assert heard.columns == ("seq", "x", "y", "z")
     assert heard.nominal_hz == pytest.approx(RATE_HZ, rel=0.1)  # with the 3 kB it would be half of it
 

@@ -21,7 +21,7 @@ from tests.unit.zenoh_site import KEY, Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
-from agent.monitor.notices import Watch
+from agent.monitor.notices import FleetWatch
 from agent.monitor.settings import Notices
 from tests.unit.monitor_site import Served
 
@@ -97,7 +97,7 @@ def test_a_copied_card_is_told_to_the_second_gateway_to_consumers_and_on_the_pag
     shutil.copytree(tmp_path / "card", tmp_path / "copy")
     with ExitStack() as opened:
         served = opened.enter_context(Served(site, tmp_path / "monitor"))
-        watch = Watch(served.fleet, Notices(), [])
+        watch = FleetWatch(served.fleet, Notices(), [])
         consumer = opened.enter_context(Consumer([site.endpoint]))
         threading.Thread(target=lambda: list(consumer), daemon=True).start()
         first = opened.enter_context(closing(Gateway(site, tmp_path / "card")))

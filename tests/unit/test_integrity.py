@@ -21,7 +21,7 @@ from agent.recording.integrity import Integrity, check_integrity
 from agent.recording.limits import RECORD_LIMIT
 from agent.recording.messages import encode, schema_data, topic_of
 from agent.recording.reading import RecordingReader
-from agent.recording.records import MAGIC, RecordError
+from agent.recording.records import MAGIC, FileRecordError
 from tests.replay.forgery import records, with_sums, write_messages
 from tests.replay.stand_in import CONFIG, StandIn, happenings, record_run, run_start
 
@@ -289,5 +289,5 @@ def test_mutated_messages_in_sound_files_are_refused_cleanly(tmp_path: Path) -> 
 
 
 def test_a_walk_ends_with_the_fault() -> None:
-    with pytest.raises(RecordError, match="does not begin with the bytes of an MCAP file"):
+    with pytest.raises(FileRecordError, match="does not begin with the bytes of an MCAP file"):
         records(b"not an mcap file")

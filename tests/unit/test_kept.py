@@ -11,8 +11,8 @@ import pytest
 from agent.config import Channel, parse_config
 from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import Estimation
-from agent.core.kept import Kept, keep, take_up
-from agent.core.outcome import Source, calibration_update
+from agent.core.kept import KeptEstimation, keep, take_up
+from agent.core.outcome import ResultSource, calibration_update
 from agent.core.snapshot import pack, unpack
 
 G = 9.80665
@@ -35,11 +35,13 @@ def state_of(made_with: Channel) -> bytes:
     """A state with a calibration in force."""
     estimation = Estimation(made_with, None)
     state = estimation.state
-    in_force = calibration_update(Source("s", "A", "m/s2", 5), estimation.in_force, state, state.shares, lambda _: None)
+    in_force = calibration_update(
+        ResultSource("s", "A", "m/s2", 5), estimation.in_force, state, state.shares, lambda _: None
+    )
     return keep(DriverFilters(made_with), "", estimation, in_force, None, 0.0, 5)
 
 
-def after(before: Channel, now: Channel) -> Kept:
+def after(before: Channel, now: Channel) -> KeptEstimation:
     return take_up(state_of(before), DriverFilters(now), None)
 
 

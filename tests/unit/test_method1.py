@@ -13,7 +13,7 @@ from calib.estimate.nuisances import Priors
 from calib.geometry import along, clamp, on_axis
 from calib.model import Pose
 from calib.paper import method1
-from calib.paper.amplitudes import Run
+from calib.paper.amplitudes import SineRun
 
 S_TRUE = np.array([[1.02, 0.03, -0.02], [0.015, 0.98, 0.025], [-0.03, 0.02, -1.01]])  # z with its polarity turned
 G = 9.81
@@ -30,7 +30,7 @@ def run(
     rng: np.random.Generator | None = None,
     sideways: complex = 0.0,
     n: int = 2000,
-) -> Run:
+) -> SineRun:
     """V = S a + Q for a sine along the pose; `sideways` is motion along the axis after the first excited one."""
     t = 20.0 + np.arange(n) / 1000.0
     omega = 2 * pi * F
@@ -42,10 +42,10 @@ def run(
         assert rng is not None
         v = v + noise * rng.normal(size=v.shape)
     reference = (amplitude / (1j * omega) * turning).real if velocity else amplitude * turning.real
-    return Run(t, reference, v, pose, "velocity" if velocity else "acceleration")
+    return SineRun(t, reference, v, pose, "velocity" if velocity else "acceleration")
 
 
-def each_axis(**options: object) -> list[Run]:
+def each_axis(**options: object) -> list[SineRun]:
     return [run(on_axis(axis), **options) for axis in "xyz"]  # type: ignore[arg-type]
 
 
@@ -129,19 +129,19 @@ def test_remounted_sensors_average_their_mounting_and_repeated_ones_do_not() -> 
 def test_positions_that_are_no_axis_are_refused(pose: Pose, message: str) -> None:
     t = np.arange(1000) / 1000
     with pytest.raises(ValueError, match=message):
-        method1.solve([Run(t, np.sin(t), np.zeros((1000, 3)), pose)])
+        method1.solve([SineRun(t, np.sin(t), np.zeros((1000, 3)), pose)])
 
 
 def test_data_that_cannot_be_used_are_named() -> None:
     good = run(on_axis("x"))
     with pytest.raises(ValueError, match="position axis x: the signal does not move"):
-        method1.solve([Run(good.time_s, np.zeros(2000), good.indications, good.pose)])
+        method1.solve([SineRun(good.time_s, np.zeros(2000), good.indications, good.pose)])
     with pytest.raises(ValueError, match="position axis x: 1 whole cycle, 2 are needed"):
         method1.solve([run(on_axis("x"), n=500)])
     with pytest.raises(ValueError, match="at least one run"):
         method1.solve([])
     noisy = good.reference + 10 * np.sin(2 * pi * 7.3 * good.time_s)
-    reasons = method1.solve([Run(good.time_s, noisy, good.indications, good.pose)]).reasons
+    reasons = method1.solve([SineRun(good.time_s, noisy, good.indications, good.pose)]).reasons
     assert len(reasons) == 1
     assert "no sine" in reasons[0]
     late = method1.solve([run(on_axis("x"), lag_s=0.25 / F)])

@@ -11,12 +11,12 @@ from numpy.testing import assert_allclose
 from calib.estimate.nuisances import Priors
 from calib.geometry import clamp, on_axis
 from calib.paper import method2
-from calib.paper.amplitudes import AmplitudeCalibration, Run
+from calib.paper.amplitudes import AmplitudeCalibration, SineRun
 
 G, F, THETA = 9.81, 3.0, 35.0
 
 
-def run(S: np.ndarray, alpha_deg: float, n: int = 2000, rate_hz: float = 1000.0, theta_deg: float = THETA) -> Run:
+def run(S: np.ndarray, alpha_deg: float, n: int = 2000, rate_hz: float = 1000.0, theta_deg: float = THETA) -> SineRun:
     """Eqs. (9)-(11) and (8) written out."""
     t = np.arange(n) / rate_hz
     theta, alpha = radians(theta_deg), radians(alpha_deg)
@@ -25,7 +25,7 @@ def run(S: np.ndarray, alpha_deg: float, n: int = 2000, rate_hz: float = 1000.0,
     ay = -a_ref * cos(alpha) * cos(theta) - G * sin(theta) * cos(alpha)
     az = a_ref * sin(theta) - G * cos(theta)
     V = np.column_stack([S[i, 0] * ax + S[i, 1] * ay + S[i, 2] * az + 0.1 for i in range(3)])
-    return Run(t, a_ref, V, clamp(radians(THETA), radians(alpha_deg), G))
+    return SineRun(t, a_ref, V, clamp(radians(THETA), radians(alpha_deg), G))
 
 
 @pytest.mark.parametrize("alpha_deg", [45.0, 135.0, 225.0])
@@ -106,8 +106,8 @@ def test_an_axis_that_is_hardly_excited_is_left_out() -> None:
     with pytest.raises(ValueError, match="at least one run"):
         method2.solve([])
     t = np.arange(2000) / 1000
-    rest = Run(t, np.sin(t), np.zeros((2000, 3)), on_axis("x"))
-    assert np.isnan(method2.solve([Run(t, np.sin(20 * t), np.sin(20 * t)[:, None] * np.ones(3), on_axis("x"))])
+    rest = SineRun(t, np.sin(t), np.zeros((2000, 3)), on_axis("x"))
+    assert np.isnan(method2.solve([SineRun(t, np.sin(20 * t), np.sin(20 * t)[:, None] * np.ones(3), on_axis("x"))])
                     .calibration.sensitivity[1, 1])  # fmt: skip
     with pytest.raises(ValueError, match="position axis x"):
         method2.solve([rest])

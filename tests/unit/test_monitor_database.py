@@ -16,7 +16,7 @@ from agent.core.events import Result
 from agent.delivery.keys import Address
 from agent.delivery.received import Received
 from agent.monitor.database import DAY_NS, HOUR_NS, Database
-from agent.monitor.engines import DatabaseError, Engine, Postgres, Sqlite
+from agent.monitor.engines import DatabaseEngine, DatabaseError, Postgres, Sqlite
 from agent.monitor.settings import load_settings
 from agent.monitor.summaries import Summariser
 from tests.unit.postgres import postgres
@@ -37,7 +37,7 @@ def server() -> Iterator[str]:
 class Kept:
     """A database and the time that it sees."""
 
-    def __init__(self, engine: Engine, full_days: int = 2) -> None:
+    def __init__(self, engine: DatabaseEngine, full_days: int = 2) -> None:
         self.now_ns, self.engine = START, engine
         self.database = Database(engine, full_days=full_days, now_ns=lambda: self.now_ns)
 
@@ -68,7 +68,7 @@ def kept(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Kept]:
         yield Kept(engine)
 
 
-def engine_of(request: pytest.FixtureRequest, directory: Path) -> Engine:
+def engine_of(request: pytest.FixtureRequest, directory: Path) -> DatabaseEngine:
     if request.param == "SQLite":
         return Sqlite(directory / "monitor.sqlite")
     engine = Postgres(request.getfixturevalue("server"))

@@ -10,7 +10,7 @@ import pytest
 
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
-from agent.monitor.engines import Engine, open_engine
+from agent.monitor.engines import DatabaseEngine, open_engine
 from tests.unit.postgres import postgres
 from tests.unit.zenoh_site import Site, record, wait_for
 
@@ -31,7 +31,7 @@ def url(request: pytest.FixtureRequest) -> Iterator[str | None]:
             yield address
 
 
-def kept(engine: Engine) -> list[int]:
+def kept(engine: DatabaseEngine) -> list[int]:
     """The numbers in the database, in the order in which they came."""
     with engine.transaction() as run:
         return [sequence for (sequence,) in run("SELECT sequence FROM result ORDER BY number")]

@@ -19,7 +19,7 @@ from agent.keys.certificates import make_authority
 from agent.monitor import notices as notices_module
 from agent.monitor.fleet import Fleet
 from agent.monitor.messages import Notice, mail, message_of, post
-from agent.monitor.notices import Notifier, Watch
+from agent.monitor.notices import FleetWatch, NoticeSender
 from agent.monitor.settings import Email, Notices, load_settings
 from tests.unit.zenoh_site import wait_for
 
@@ -69,7 +69,7 @@ def hooked(*answers: int) -> Iterator[Hook]:
 def test_verdicts_and_states_are_told_once_and_old_ones_not() -> None:
     fleet = Fleet()
     fleet.take(*PLACE, "status", held(), fresh=False)  # of the database, when the monitor starts
-    watch = Watch(fleet, Notices(), [])
+    watch = FleetWatch(fleet, Notices(), [])
     assert watch.update(0.0, NOW) == []
     fleet.take(*PLACE, "status", held())
     fleet.take(*PLACE, "status", {"status": "VALID", "reason": "", "t_utc_ns": 1})
@@ -83,7 +83,7 @@ def test_verdicts_and_states_are_told_once_and_old_ones_not() -> None:
 
 def test_a_silent_gateway_is_told_once_and_again_when_it_is_back() -> None:
     fleet = Fleet()
-    watch = Watch(fleet, Notices(silent_s=600), [])
+    watch = FleetWatch(fleet, Notices(silent_s=600), [])
     fleet.take(*PLACE, "status", held(), fresh=False)
     for k in range(50):
         fleet.set_alive("site", f"invented{k}", True)
@@ -101,7 +101,7 @@ def test_a_silent_gateway_is_told_once_and_again_when_it_is_back() -> None:
 def test_a_certificate_that_ends_is_told_each_week(tmp_path: Path) -> None:
     path = tmp_path / "fleet.pem"
     path.write_bytes(make_authority("fleet", 40, NOW).certificate_pem)
-    watch = Watch(Fleet(), Notices(certificate_days=30), [path, tmp_path / "none.pem"])
+    watch = FleetWatch(Fleet(), Notices(certificate_days=30), [path, tmp_path / "none.pem"])
     texts = [
         [n.text for n in watch.update(86400.0 * day, NOW + timedelta(days=day))] for day in (0, 9, 11, 12, 17, 18, 41)
     ]
@@ -129,7 +129,7 @@ def test_what_could_not_be_sent_is_sent_with_the_next_message(monkeypatch: pytes
     fleet = Fleet()
     with hooked(500, 200) as hook:
         settings = Notices(webhooks=(hook.url,))
-        notifier = Notifier(Watch(fleet, settings, []), settings)
+        notifier = NoticeSender(FleetWatch(fleet, settings, []), settings)
         fleet.take(*PLACE, "status", held("first"))
         wait_for(lambda: len(hook.taken) == 2 and notifier.fault == "")
         fleet.take(*PLACE, "status", held("second"))

@@ -10,9 +10,9 @@ import pytest
 
 from agent.config import Config, parse_config
 from agent.core.events import IN_DRIVER, Command, DeviceChange, Estimate, Result, Tick
-from agent.terminal.next_step import Guide
+from agent.terminal.next_step import NextSteps
 from agent.terminal.state import ViewState
-from agent.terminal.view import Lines
+from agent.terminal.view import LineView
 from tests.unit.results import calibration, status, window
 from tests.unit.test_view import picture
 
@@ -36,7 +36,7 @@ def configured(commands: bool = False, *, reference: bool = True, **channel: Any
     return parse_config(raw, "test")
 
 
-def said(guide: Guide, *results: Result, event: Any = None) -> str:
+def said(guide: NextSteps, *results: Result, event: Any = None) -> str:
     return guide.update(event or Tick(**CLOCK), list(results)).get("mems", "")
 
 
@@ -55,11 +55,11 @@ def command(verb: str, arguments: str = "{}", refused: str = "") -> Command:
 
 
 def test_nothing_is_said_before_a_sensor_has_a_status() -> None:
-    assert said(Guide(configured(positions=CLAMP), turns_itself=False)) == ""
+    assert said(NextSteps(configured(positions=CLAMP), turns_itself=False)) == ""
 
 
 def test_each_position_that_is_left_is_named_in_turn() -> None:
-    guide = Guide(configured(positions=CLAMP), turns_itself=False)
+    guide = NextSteps(configured(positions=CLAMP), turns_itself=False)
     assert said(guide, status(1, "UNCALIBRATED")) == FIRST
     told = said(guide, used("theta 35 deg, alpha 0 deg"), status(2, "COLLECTING"))
     assert told == "turn the sensor to theta 35 deg, alpha 120 deg and stay 20 s (positions used: 1 of 3)"
@@ -70,7 +70,7 @@ def test_each_position_that_is_left_is_named_in_turn() -> None:
 
 
 def test_a_position_with_times_is_told_with_them() -> None:
-    guide = Guide(configured(poses=TIMED), turns_itself=False)
+    guide = NextSteps(configured(poses=TIMED), turns_itself=False)
     told = said(guide, status(1, "UNCALIBRATED"))
     assert told == (
         "turn the sensor to theta 35 deg, alpha 0 deg; the configuration states that position from 0 to 12 s after "
@@ -83,7 +83,7 @@ def test_a_position_with_times_is_told_with_them() -> None:
 
 
 def test_positions_that_repeat_have_no_end() -> None:
-    guide = Guide(configured(poses=TIMED, poses_repeat_s=50.0), turns_itself=False)
+    guide = NextSteps(configured(poses=TIMED, poses_repeat_s=50.0), turns_itself=False)
     late = msgspec.structs.replace(window(9, used=False), position="theta 35 deg, alpha 0 deg", stop_s=61.5)
     told = said(guide, status(1, "UNCALIBRATED"), late)
     assert (
@@ -96,7 +96,7 @@ def test_positions_that_repeat_have_no_end() -> None:
 
 def test_rests_are_told_by_the_axis_that_points_up() -> None:
     config = configured(reference=False, positions=FACES)
-    guide = Guide(config, turns_itself=False)
+    guide = NextSteps(config, turns_itself=False)
     told = said(guide, status(1, "UNCALIBRATED"))
     assert told == "put the sensor down with its +x axis up and stay 20 s (positions used: 0 of 6)"
     assert "its -x axis up" in said(guide, used(config.channels[0].stops[0].position))
@@ -112,18 +112,18 @@ def test_rests_are_told_by_the_axis_that_points_up() -> None:
     ],
 )
 def test_other_mounts(channel: dict[str, Any], words: str) -> None:
-    assert words in said(Guide(configured(**channel), turns_itself=False), status(1, "UNCALIBRATED"))
+    assert words in said(NextSteps(configured(**channel), turns_itself=False), status(1, "UNCALIBRATED"))
 
 
 def test_a_virtual_bench_turns_by_itself() -> None:
-    guide = Guide(configured(poses=TIMED), turns_itself=True)
+    guide = NextSteps(configured(poses=TIMED), turns_itself=True)
     assert said(guide, status(1, "UNCALIBRATED")) == "wait: the virtual bench turns by itself; positions used: 0"
     assert said(guide, used("a"), status(1, "COLLECTING")).endswith("positions used: 1")
     assert "Ctrl-C ends the run" in said(guide, status(2))
 
 
 def test_a_lost_device_is_named_until_it_is_back() -> None:
-    guide = Guide(configured(positions=CLAMP), turns_itself=False)
+    guide = NextSteps(configured(positions=CLAMP), turns_itself=False)
     said(guide, status(1))
     for device in ("mems", "laser"):
         told = said(guide, status(2), event=DeviceChange(device=device, state="lost", **CLOCK))
@@ -134,7 +134,7 @@ def test_a_lost_device_is_named_until_it_is_back() -> None:
 
 
 def test_a_fault_of_a_driver_is_no_matter_of_cables() -> None:
-    guide = Guide(configured(positions=CLAMP), turns_itself=False)
+    guide = NextSteps(configured(positions=CLAMP), turns_itself=False)
     change = DeviceChange(device="mems", state="lost", message=f"{IN_DRIVER} lab.Imu: KeyError: 'x'", **CLOCK)
     told = said(guide, status(1, "INVALID"), event=change)
     assert told == "use another version of the driver of mems, and tell its author of the fault"
@@ -160,7 +160,7 @@ def test_what_helps_follows_from_the_statistic_that_refuses(
     name: str, value: float, threshold: float, words: str
 ) -> None:
     for state in ("UNCALIBRATED", "COLLECTING", "VALID"):
-        guide = Guide(configured(positions=CLAMP), turns_itself=False)
+        guide = NextSteps(configured(positions=CLAMP), turns_itself=False)
         one, *rest = refused(name, value, threshold)
         assert words not in said(guide, status(1, state), one), "one window is no reason"
         assert words in said(guide, *rest)
@@ -168,7 +168,7 @@ def test_what_helps_follows_from_the_statistic_that_refuses(
 
 
 def test_held_and_what_ends_it() -> None:
-    guide = Guide(configured(commands=True, positions=CLAMP), turns_itself=False)
+    guide = NextSteps(configured(commands=True, positions=CLAMP), turns_itself=False)
     told = said(guide, status(1, "HELD", "the window contradicts the calibration"))
     assert "5 windows that agree confirm a change, 3 that fit the calibration end HELD" in told
     told = said(guide, estimate(7))
@@ -179,13 +179,13 @@ def test_held_and_what_ends_it() -> None:
 
 def test_an_estimate_cannot_be_accepted_where_commands_are_off() -> None:
     for channel in ({}, {"gate": {"policy": "propose"}}):
-        guide = Guide(configured(positions=CLAMP, **channel), turns_itself=False)
+        guide = NextSteps(configured(positions=CLAMP, **channel), turns_itself=False)
         told = said(guide, estimate(7), status(8, "COLLECTING" if channel else "HELD"))
         assert "enable [commands] in the configuration" in told
 
 
 def test_a_hold_lasts_until_it_is_released() -> None:
-    guide = Guide(configured(commands=True, positions=CLAMP), turns_itself=False)
+    guide = NextSteps(configured(commands=True, positions=CLAMP), turns_itself=False)
     release = "`fieldcal command hold --release --sensor mems` lets the agent use windows again"
     assert said(guide, status(1, "HELD"), event=command("hold", refused="no right")) != release
     assert said(guide, status(1, "HELD"), event=command("hold")) == release
@@ -193,7 +193,7 @@ def test_a_hold_lasts_until_it_is_released() -> None:
     assert said(guide, event=command("rollback")).startswith("nothing"), "the calibration was another device's"
     assert said(guide, calibration(3), event=command("rollback")) == release
     begun = msgspec.structs.replace(status(1, "HELD", "restored from the previous run"), before="")
-    assert said(Guide(configured(positions=CLAMP), turns_itself=False), begun) == release
+    assert said(NextSteps(configured(positions=CLAMP), turns_itself=False), begun) == release
 
 
 def estimate(sequence: int) -> Estimate:
@@ -203,7 +203,7 @@ def estimate(sequence: int) -> Estimate:
 
 def test_the_line_is_shown_when_it_changes_and_stays_on_the_screen() -> None:
     state, stream = ViewState("gateway.toml", "site/gateway"), io.StringIO()
-    view = Lines(state, stream)
+    view = LineView(state, stream)
     for step in (FIRST, FIRST, "nothing has to be done", FIRST):
         state.take([status(1)])
         state.next_steps["mems"] = step
@@ -216,5 +216,5 @@ def test_the_line_is_shown_when_it_changes_and_stays_on_the_screen() -> None:
 
 def test_without_a_reference_and_positions_the_configuration_is_named() -> None:
     """The agent ended with an internal fault when it looked for the next of no positions."""
-    guide = Guide(configured(reference=False), turns_itself=False)
+    guide = NextSteps(configured(reference=False), turns_itself=False)
     assert said(guide, status(1, "UNCALIBRATED")).startswith("calibrate it at a bench or by a visit")

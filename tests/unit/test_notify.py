@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.supervision.notify import STATUS_MAX, Notifier
+from agent.supervision.notify import STATUS_MAX, SystemdNotifier
 
 
 class Receiver:
@@ -42,7 +42,7 @@ def systemd(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Receiver
 
 
 def test_what_is_said_arrives(systemd: Receiver) -> None:
-    notifier = Notifier({"NOTIFY_SOCKET": systemd.address})
+    notifier = SystemdNotifier({"NOTIFY_SOCKET": systemd.address})
     assert notifier.ready()
     notifier.status("running: all\nis well")
     notifier.status("running: all\nis well")
@@ -53,7 +53,9 @@ def test_what_is_said_arrives(systemd: Receiver) -> None:
 
 
 def test_the_watchdog_is_fed_as_often_as_it_needs_and_only_when_fed(systemd: Receiver) -> None:
-    notifier = Notifier({"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "400000", "WATCHDOG_PID": str(os.getpid())})
+    notifier = SystemdNotifier(
+        {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "400000", "WATCHDOG_PID": str(os.getpid())}
+    )
     assert notifier.watchdog_s == pytest.approx(0.4)
     end_s = time.monotonic() + 0.35
     while time.monotonic() < end_s:
@@ -71,7 +73,7 @@ def test_the_watchdog_is_fed_as_often_as_it_needs_and_only_when_fed(systemd: Rec
     [{}, {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "soon"}, {"WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}],
 )
 def test_without_a_watchdog_of_ours_nothing_is_fed(systemd: Receiver, environment: dict[str, str]) -> None:
-    notifier = Notifier(environment | {"NOTIFY_SOCKET": systemd.address})
+    notifier = SystemdNotifier(environment | {"NOTIFY_SOCKET": systemd.address})
     notifier.feed()
     assert systemd.told() == []
     notifier.close()
@@ -79,7 +81,7 @@ def test_without_a_watchdog_of_ours_nothing_is_fed(systemd: Receiver, environmen
 
 @pytest.mark.parametrize("address", ["", "relative/path", "vsock:2:1234", "/nobody/is/there"])
 def test_without_systemd_nothing_fails(address: str) -> None:
-    notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"} if address else {})
+    notifier = SystemdNotifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000"} if address else {})
     notifier.status("running")
     notifier.feed()
     notifier.stopping()
@@ -88,7 +90,7 @@ def test_without_systemd_nothing_fails(address: str) -> None:
 
 
 def test_a_full_queue_does_not_block_and_ready_is_not_lost(systemd: Receiver) -> None:
-    notifier = Notifier({"NOTIFY_SOCKET": systemd.address})
+    notifier = SystemdNotifier({"NOTIFY_SOCKET": systemd.address})
     for n in range(100):
         notifier.status(f"{n}")
     assert not notifier.ready()
@@ -101,5 +103,5 @@ def test_a_full_queue_does_not_block_and_ready_is_not_lost(systemd: Receiver) ->
 
 def test_a_child_process_is_not_this_service(systemd: Receiver) -> None:
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "1000000", "HOME": "/"}
-    Notifier(environment).close()
+    SystemdNotifier(environment).close()
     assert environment == {"HOME": "/"}

@@ -14,7 +14,7 @@ from agent.cli.show import show
 from agent.core.events import Acceleration, CalibrationUpdate
 from agent.core.outcome import again
 from agent.delivery.calibrations import calibrations
-from agent.delivery.history import FILE_NAME, History, Record
+from agent.delivery.history import FILE_NAME, History, StoredResult
 from agent.delivery.store import Store
 from agent.recording.messages import decode, encode
 from agent.report.material import gather
@@ -35,7 +35,7 @@ def later(update: CalibrationUpdate, sequence: int) -> CalibrationUpdate:
 
 def commit(directory: Path, *results: object) -> None:
     store = Store(directory, 0)
-    store.commit([Record.of(r, recorded=True, recording="fieldcal-000009.mcap") for r in results])  # type: ignore[arg-type]
+    store.commit([StoredResult.of(r, recorded=True, recording="fieldcal-000009.mcap") for r in results])  # type: ignore[arg-type]
     store.close()
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.certificate.content import Certificate
+from agent.certificate.content import ResultCertificate
 from agent.certificate.dcc import dcc
 from agent.certificate.making import as_object, certificate_of
-from agent.certificate.signing import Signer
-from agent.certificate.statements import Statements
+from agent.certificate.signing import CertificateSigner
+from agent.certificate.statements import CertificateStatements
 from agent.certificate.wording import before_results, parameters
 from agent.cli.main import run_cli
 from agent.config.earlier import read_earlier
@@ -52,10 +52,10 @@ def report(result: Path) -> str:
     return words(page(gather([result], None), [], []))
 
 
-def certificate(folder: Path, result: Path, **changes: str) -> Certificate:
+def certificate(folder: Path, result: Path, **changes: str) -> ResultCertificate:
     """The certificate with the example's statements, in which `changes` replace lines by their entry."""
     material = gather([result], None)
-    stated = load_model(statements(folder, **changes), Statements)
+    stated = load_model(statements(folder, **changes), CertificateStatements)
     return certificate_of(material, stated, folder, left_over(material))
 
 
@@ -67,7 +67,7 @@ def statements(folder: Path, **changes: str) -> Path:
     return folder / "certificate.toml"
 
 
-def rows(found: Certificate) -> dict[str, str]:
+def rows(found: ResultCertificate) -> dict[str, str]:
     """Value, U and unit of each parameter, as the certificate shows them."""
     return {name: f"{value} {unit}" for name, value, unit, *_ in parameters(found)}
 
@@ -79,7 +79,7 @@ def first(told: dict[str, Any], factor: float) -> str:
     )
 
 
-def reference_of(found: Certificate) -> str:
+def reference_of(found: ResultCertificate) -> str:
     return next(text for section in before_results(found, "") for name, text in section.rows if name == "reference")
 
 
@@ -116,7 +116,7 @@ def test_the_unit_is_in_table_report_and_certificate(tmp_path: Path, capsys: pyt
     assert rows(found)["S xx"] == f"{first(told, 1.0)} mV/(m/s²)"
     assert rows(found)["Q x"].endswith(" mV")
     assert as_object(found)["result"]["output_unit"] == "mV"
-    assert r"\milli\volt\metre\tothe{-1}" in dcc(found, Signer(None, "")).decode()
+    assert r"\milli\volt\metre\tothe{-1}" in dcc(found, CertificateSigner(None, "")).decode()
 
 
 def test_a_unit_that_contradicts_the_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -161,7 +161,7 @@ def test_an_output_in_g_is_shown_in_g_per_g_and_mg(
     found = certificate(tmp_path, result, output_unit="")
     assert rows(found)["S xx"] == f"{first(told, G_MPS2 / one_g)} g/g"
     assert re.fullmatch(r"\d\d\.\d ± \d\.\d mg", rows(found)["Q x"])
-    xml = dcc(found, Signer(None, ""))
+    xml = dcc(found, CertificateSigner(None, ""))
     assert f"numbers in {unit}: {one_g:g} is 9.80665 m/s²" in xml.decode()
     (tmp_path / "earlier.xml").write_bytes(xml)
     np.testing.assert_array_equal(read_earlier(tmp_path / "earlier.xml")[0][:9], np.ravel(told["sensitivity"]))
@@ -175,7 +175,7 @@ def test_a_reference_of_velocity_is_a_vibrometer(tmp_path: Path) -> None:
     assert "beside a reference vibrometer (velocity)" in report(result)
     found = certificate(tmp_path, result, output_unit="")
     assert reference_of(found) == "reference vibrometer (velocity): PCB 393B12, serial number LW-1234"
-    xml = dcc(found, Signer(None, "")).decode()
+    xml = dcc(found, CertificateSigner(None, "")).decode()
     assert "reference vibrometer (velocity)" in xml
     assert "reference accelerometer" not in xml
     named = certificate(tmp_path, result, output_unit="", manufacturer='name = "laser"\nmanufacturer = "Polytec"\n')
@@ -210,7 +210,7 @@ def test_a_warning_is_told_once_wherever_the_result_is_read(tmp_path: Path, caps
     first = next(before_results(found, ""))
     assert (first.heading, list(first.rows)) == ("Warnings", [("warning", warning) for warning in warnings])
     assert as_object(found)["result"]["warnings"] == warnings
-    assert dcc(found, Signer(None, "")).decode().count("det S is negative") == 1
+    assert dcc(found, CertificateSigner(None, "")).decode().count("det S is negative") == 1
     inverted = calibrate({n: v if n == "time_s" else -v for n, v in SENSOR.items()}, REFERENCE, POSES, **OPTIONS)
     html = inverted._repr_html_()
     assert html.count("Warning: det S is negative") == 1

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.excitation.placing import WIDER, Knowledge, MeanOutput, clamp_angles, mean_output, nearest_stop
+from calib.excitation.placing import WIDER, MeanOutput, PlacingUncertainty, clamp_angles, mean_output, nearest_stop
 from calib.geometry import at_rest
 from calib.model import Calibration, Pose
 from tests.clamp_windows import frame
 
 G_MPS2 = 9.80665
 DEGREE = np.deg2rad(1.0)
-KNOWLEDGE = Knowledge(angle_rad=0.3 * DEGREE, gravity_mps2=0.03, offset=0.05)
-EXACT = Knowledge(angle_rad=0.0, gravity_mps2=0.0, offset=1e-9)
+KNOWLEDGE = PlacingUncertainty(angle_rad=0.3 * DEGREE, gravity_mps2=0.03, offset=0.05)
+EXACT = PlacingUncertainty(angle_rad=0.0, gravity_mps2=0.0, offset=1e-9)
 NOTHING = np.zeros((3, 3))
 GOOD = (0.003, 0.003, 0.02)  # u of main and transverse sensitivities, and of Q in m/s2
 POOR = (0.05, 0.03, 0.5)  # a data sheet's
@@ -56,7 +56,7 @@ def test_two_stops_five_degrees_apart_are_undecided_until_the_offset_is_known(se
 @pytest.mark.parametrize("scale", [1.0, 26_000.0])
 def test_a_stop_that_nobody_stated_is_refused_with_the_numbers(scale: float) -> None:
     stops, known = [leaning(0.0), leaning(30.0)], knowing(GOOD, scale)
-    knowledge = Knowledge(KNOWLEDGE.angle_rad, KNOWLEDGE.gravity_mps2, scale * KNOWLEDGE.offset)
+    knowledge = PlacingUncertainty(KNOWLEDGE.angle_rad, KNOWLEDGE.gravity_mps2, scale * KNOWLEDGE.offset)
     mean = MeanOutput(scale * leaning(15.0).gravity_mps2, NOTHING)
     found = nearest_stop(mean, stops, known, knowledge)
     assert found.pose is None

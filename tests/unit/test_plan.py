@@ -12,7 +12,7 @@ pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 pytest.importorskip("argon2", reason="the extra monitor is not installed")
 
-from agent.monitor.pictures import Picture, PictureError, picture_of
+from agent.monitor.pictures import ImageKind, PictureError, picture_of
 from agent.monitor.plan import LARGEST_PICTURE
 from agent.monitor.users import set_user
 from tests.unit.monitor_site import Answer, Served
@@ -36,9 +36,9 @@ def jpeg(width: int, height: int, frame: int = 0xC0) -> bytes:
 
 
 def test_type_and_size_of_pictures() -> None:
-    assert picture_of(png(640, 480)) == Picture("image/png", 640, 480)
-    assert picture_of(jpeg(640, 480)) == Picture("image/jpeg", 640, 480)
-    assert picture_of(jpeg(640, 480, frame=0xC2)) == Picture("image/jpeg", 640, 480)  # progressive
+    assert picture_of(png(640, 480)) == ImageKind("image/png", 640, 480)
+    assert picture_of(jpeg(640, 480)) == ImageKind("image/jpeg", 640, 480)
+    assert picture_of(jpeg(640, 480, frame=0xC2)) == ImageKind("image/jpeg", 640, 480)  # progressive
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscriber
 
-from agent.delivery.history import Record, StoreError
+from agent.delivery.history import StoredResult, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.session import EndpointError
 from agent.delivery.store import Store
@@ -82,7 +82,9 @@ def test_what_is_published_arrives_in_order_as_json_with_the_number_before(
 def test_the_clocks_of_both_devices_are_published_as_json_and_a_late_get_brings_the_sensors(
     site: Site, store: Store, publisher: Publisher
 ) -> None:
-    pair = [Record.of(clock(n, device=d), recorded=True, recording="f") for n, d in ((1, "reference"), (2, "mems"))]
+    pair = [
+        StoredResult.of(clock(n, device=d), recorded=True, recording="f") for n, d in ((1, "reference"), (2, "mems"))
+    ]
     with site.client() as client:
         subscriber = client.declare_subscriber(f"{KEY}/mems/clock", zenoh.handlers.RingChannel(10))
         publisher.start()

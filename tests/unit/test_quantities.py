@@ -15,7 +15,7 @@ from agent.config.knowledge import (
     Knowledge,
     Prior,
     Process,
-    Setting,
+    StatedFields,
     Temperature,
     Uncertainty,
 )
@@ -129,7 +129,7 @@ def test_what_wanders_wanders_by_its_own_walk() -> None:
 
 
 @pytest.mark.parametrize("setting", [*AT_FIXED_MOUNT.values(), *WALKS_STATED.values()], ids=lambda s: s.fields[0])
-def test_every_setting_is_in_the_configuration(setting: Setting) -> None:
+def test_every_setting_is_in_the_configuration(setting: StatedFields) -> None:
     for place in setting.fields:
         section, field = place.split(".")
         assert isinstance(getattr(getattr(STATED, section), field), float)

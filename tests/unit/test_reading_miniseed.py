@@ -13,7 +13,7 @@ from agent.calibrate.tables import SensorFile, read_sensor
 from agent.reading import seismic
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.seismic import open_miniseed
-from agent.reading.stationxml import Component, StationXml
+from agent.reading.stationxml import StationChannel, StationXml
 from tests.unit.test_reading_csv import written
 from tests.unit.test_reading_formats import fault
 
@@ -149,7 +149,7 @@ def test_the_times_of_the_records_tell_the_rate(true_hz: float, tmp_path: Path) 
 
 def test_each_stretch_is_differentiated_alone(tmp_path: Path) -> None:
     components = tuple(
-        Component(f"XX.A..HN{code}", 0.0, 1e11, RATE_HZ, "M/S", 1e5, 1.0, azimuth, dip)
+        StationChannel(f"XX.A..HN{code}", 0.0, 1e11, RATE_HZ, "M/S", 1e5, 1.0, azimuth, dip)
         for code, azimuth, dip in (("E", 90.0, 0.0), ("N", 0.0, 0.0), ("Z", 0.0, -90.0))
     )
 

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from agent.certificate.recall import PURPOSE
 from agent.cli.main import run_cli
 from agent.core.events import CalibrationUpdate, SharedError
-from agent.delivery.history import FILE_NAME, History, Record
+from agent.delivery.history import FILE_NAME, History, StoredResult
 from agent.delivery.store import Store
 from agent.recording.signed_text import SignedText, values_of
 from tests.unit.certificates import uneven
@@ -91,7 +91,7 @@ def test_a_thousand_results_take_seconds_and_each_file_is_signed(recorded: Path,
     many = [msgspec.structs.replace(update, run_id="many", sequence=k) for k in range(1, 1001)]
     (tmp_path / "many").mkdir()
     store = Store(tmp_path / "many", 0)
-    store.commit([Record.of(r, recorded=False, recording="") for r in many], {})
+    store.commit([StoredResult.of(r, recorded=False, recording="") for r in many], {})
     store.close()
     key = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
     pem = tmp_path / "key.pem"

@@ -15,7 +15,7 @@ from agent.core.events import CalibrationUpdate, Event, Result, RunStart
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
 from agent.core.snapshot import unpack
-from agent.delivery.history import History, Record
+from agent.delivery.history import History, StoredResult
 from agent.delivery.store import Store
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader
@@ -74,7 +74,7 @@ def behind(directory: Path, results: Sequence[Result], memory: Memory) -> None:
     """A store beside the recordings as a killed process leaves it: with the results up to a state, and that state."""
     elsewhere = directory / "elsewhere"
     store = Store(elsewhere, 0)
-    known = [Record.of(r, recorded=True, recording="") for r in results if r.sequence <= memory.sequence]
+    known = [StoredResult.of(r, recorded=True, recording="") for r in results if r.sequence <= memory.sequence]
     store.commit(known, [memory])
     os.close(store._lock)  # a killed process lets go of its lock and does no more
     for path in elsewhere.glob("state.sqlite*"):

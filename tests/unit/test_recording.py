@@ -23,15 +23,15 @@ from agent.core.events import Gap, Tick
 from agent.recording.files import FILE_METADATA, recordings
 from agent.recording.integrity import check_integrity
 from agent.recording.messages import encode
-from agent.recording.reading import RecordingReader, Step
-from agent.recording.records import Record, RecordError, walk
+from agent.recording.reading import RecordedStep, RecordingReader
+from agent.recording.records import FileRecord, FileRecordError, walk
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, EPOCH_NS, SECOND, StandIn, block, happenings, record_run, run_start
 
 REPOSITORY = Path(__file__).parents[2]
 
 
-def read(path: Path) -> list[Step]:
+def read(path: Path) -> list[RecordedStep]:
     return list(RecordingReader(path).steps())
 
 
@@ -56,10 +56,10 @@ def origin(path: Path) -> tuple[str, str]:
     return metadata["previous_file"], metadata["previous_sha256"]
 
 
-def records(data: bytes) -> list[Record]:
+def records(data: bytes) -> list[FileRecord]:
     """The records of a file that may end early."""
-    found: list[Record] = []
-    with suppress(RecordError):
+    found: list[FileRecord] = []
+    with suppress(FileRecordError):
         found.extend(walk(io.BytesIO(data), len(data)))
     return found
 

@@ -17,7 +17,7 @@ from agent.cli.run import serve
 from agent.config import Config, parse_config
 from agent.core.events import DeviceChange
 from agent.recording.reading import RecordingReader
-from agent.terminal.watch import Watch
+from agent.terminal.watch import RunView
 from hw.block import SampleBlock
 from hw.virtual.adxl345_twin import Adxl345Twin
 from hw.virtual.kernel import BCM2835, SMBUS_ONLY, Adapter, I2CBus, installed
@@ -159,7 +159,7 @@ def test_adapters_of_the_twins(
     }
     nodes = {f"/dev/i2c-{k}": bus(adapter) for k, adapter in enumerate(adapters)}
     config = parse_config(raw, "test")
-    with installed(nodes), Watch(config, "test", None) as watch:
+    with installed(nodes), RunView(config, "test", None) as watch:
         began_s = time.monotonic()
         assert serve(Service(config, tmp_path, watch), 4.0 if status == 0 else 60.0) == status
         assert status == 0 or time.monotonic() - began_s < 20.0, "it ends at once"

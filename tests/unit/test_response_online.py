@@ -17,11 +17,11 @@ from benchmarks.online.node import Node, Stated, Timing, node
 from benchmarks.online.runner import Run, visits
 from calib.model import Array
 from hw.virtual.building import Building
-from hw.virtual.building_motion import Band
+from hw.virtual.building_motion import BuildingSpectrum
 from tests.pair import Filter, both, flat, highpass, lowpass, moving_mean, resonance
 
 SEED, WINDOWS = 1, 8
-BROAD = Band(0.5, 12.0)
+BROAD = BuildingSpectrum(0.5, 12.0)
 FILTERS = {
     "flat": flat,
     "low-pass of order 1, 31 Hz": lowpass(1, 31.0),
@@ -34,7 +34,7 @@ SAME_PCT = 0.03  # of S: the two runs share noise and errors, and differ by the 
 SAME_OFFSET_MPS2 = 0.006
 
 
-def filtered(response: Filter, band: Band = BROAD, where: str = "sensor") -> tuple[Node, Building]:
+def filtered(response: Filter, band: BuildingSpectrum = BROAD, where: str = "sensor") -> tuple[Node, Building]:
     """A node that moves on all axes in this band, one of its instruments with this filter."""
     drawn = node(SEED, all_axes=True, stated=Stated(lag_s=0.01), timing=Timing(20.0, 60.0, WINDOWS))
     parameters = replace(drawn.building.parameters, band=band)
@@ -107,13 +107,13 @@ def test_the_response_is_told_by_frequency(name):
 @pytest.mark.thorough
 def test_s_means_the_same_when_the_motion_becomes_wider():
     name = "low-pass of order 1, 31 Hz"
-    drawn, calm = filtered(FILTERS[name], Band(0.5, 6.0))
-    _, wild = filtered(FILTERS[name], Band(0.5, 15.0))
+    drawn, calm = filtered(FILTERS[name], BuildingSpectrum(0.5, 6.0))
+    _, wild = filtered(FILTERS[name], BuildingSpectrum(0.5, 15.0))
     found = newest(drawn, [*visits(calm, range(4)), *visits(wild, range(4, WINDOWS))])
     assert found.windows >= WINDOWS - 1
     assert found.response[-1].high_hz < 7.0  # the motion above the first band is not used
-    drawn, calm = filtered(flat, Band(0.5, 6.0))
-    _, wild = filtered(flat, Band(0.5, 15.0))
+    drawn, calm = filtered(flat, BuildingSpectrum(0.5, 6.0))
+    _, wild = filtered(flat, BuildingSpectrum(0.5, 15.0))
     without = newest(drawn, [*visits(calm, range(4)), *visits(wild, range(4, WINDOWS))])
     assert deviation_pct(found, np.array(without.sensitivity) * size(name, found)) < SAME_PCT
 
@@ -122,7 +122,7 @@ def test_s_means_the_same_when_the_motion_becomes_wider():
 def test_windows_at_one_frequency_before_count_as_what_they_are():
     """A first window at 3 Hz knows S there; the response came later."""
     name = "low-pass of order 1, 31 Hz"
-    line = Band(2.9, 3.1, modes=((3.0, 0.01),))
+    line = BuildingSpectrum(2.9, 3.1, modes=((3.0, 0.01),))
     found, without = (
         newest(drawn, [*visits(narrow, range(3)), *visits(wide, range(3, WINDOWS))])
         for (drawn, narrow), (_, wide) in (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.rows import Degrees, Noise, Rows
+from calib.estimate.rows import Degrees, NoiseScores, Rows
 from calib.estimate.statements import Statements, Step
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
@@ -68,7 +68,9 @@ def test_derivatives_are_those_of_what_is_predicted(name: str) -> None:
     # A turn is added to the left of the one before: where that is none, both are the same sum.
     x = mean + np.where(turns, 0.0, np.minimum(u, 0.1)) * random.normal(size=len(mean))
     x[:9] += 0.1 * random.normal(size=9)
-    rows = Rows(unknowns, own, np.array([0.25, 0.25]), [Noise(), Noise()], Degrees((0.0, 0.0), np.zeros((2, 3))))
+    rows = Rows(
+        unknowns, own, np.array([0.25, 0.25]), [NoiseScores(), NoiseScores()], Degrees((0.0, 0.0), np.zeros((2, 3)))
+    )
 
     def at(values: np.ndarray) -> list[np.ndarray]:
         return rows.at(np.tile(values, (2, 1)), np.tile(values, (2, 1)))

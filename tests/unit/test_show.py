@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from agent.cli.show import show
 from agent.core.events import Result as PipelineResult
-from agent.delivery.history import FILE_NAME, Record
+from agent.delivery.history import FILE_NAME, StoredResult
 from agent.delivery.store import Store
 from tests.unit.results import calibration, clock, status, window
 
@@ -25,7 +25,7 @@ def run_show(*arguments: str | Path) -> Result:
 
 def fill(directory: Path, *results: PipelineResult) -> Store:
     store = Store(directory, 0)
-    store.commit([Record.of(r, recorded=True, recording="fieldcal-000001.mcap") for r in results])
+    store.commit([StoredResult.of(r, recorded=True, recording="fieldcal-000001.mcap") for r in results])
     return store
 
 
@@ -111,7 +111,7 @@ def test_what_is_no_store_is_one_line_and_status_2(tmp_path: Path, content: byte
 
 def test_a_result_of_another_version_is_one_line_and_status_2(tmp_path: Path) -> None:
     store = Store(tmp_path, 0)
-    store.commit([Record(1, "r", "mems", "calibration", b'{"sequence":1}', 1, True, "f")])
+    store.commit([StoredResult(1, "r", "mems", "calibration", b'{"sequence":1}', 1, True, "f")])
     store.close()
     said = run_show("--data-dir", tmp_path)
     assert said.return_value == 2

@@ -13,7 +13,7 @@ from calib.site_watch.day import Day, Hours, day_of
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR, TERMS, Steps, inverted
 from calib.site_watch.together import ALL, DIRECTIONS, design, jointly
-from calib.site_watch.verdicts import Result, examined, limit_of, result
+from calib.site_watch.verdicts import SiteVerdicts, examined, limit_of, result
 from calib.site_watch.watch import SiteWatch
 
 BANDS_HZ = 10.0 ** (np.arange(0, 6) / 10.0)
@@ -63,14 +63,14 @@ def learned() -> tuple[Site, SiteWatch]:
     return site, watched(site, 60)
 
 
-def after(learned: tuple[Site, SiteWatch], days: int, sensors: list[int], theta: list[float]) -> Result:
+def after(learned: tuple[Site, SiteWatch], days: int, sensors: list[int], theta: list[float]) -> SiteVerdicts:
     site = copy.deepcopy(learned[0])
     change = np.zeros((site.n, 6))
     change[sensors] = theta
     return result(watched(site, days, SiteWatch.loaded(learned[1].snapshot()), change))
 
 
-def kinds(found: Result) -> dict[int, str]:
+def kinds(found: SiteVerdicts) -> dict[int, str]:
     return {i: told.kind for i, told in enumerate(found.sensors) if told.kind != "none"}
 
 

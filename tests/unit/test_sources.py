@@ -14,7 +14,7 @@ from agent.core.snapshot import pack, unpack
 from agent.recording.messages import decode, encode, schema_of, topic_of
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.rows import CORRECTION, LAGS, OFFSETS, TYPE_A, Degrees, Noise, Rows
+from calib.estimate.rows import CORRECTION, LAGS, OFFSETS, TYPE_A, Degrees, NoiseScores, Rows
 from calib.estimate.statements import Statements, Step
 from calib.estimate.wander import TemperatureModel
 from calib.model import Array, Calibration
@@ -92,7 +92,7 @@ def test_lags_of_windows_have_a_share_where_they_are_stated(clamped: list[Record
 
 def test_noise_has_the_share_by_which_it_moves_s_and_q(clamped: list[Record]) -> None:
     linear, errors = Linear(clamped), []
-    for w, (record, noise) in enumerate(zip(clamped, Noise.around(clamped), strict=True)):
+    for w, (record, noise) in enumerate(zip(clamped, NoiseScores.around(clamped), strict=True)):
         of_slopes, of_means = (
             record.noise * np.sqrt(max(ratio / record.independent, LEAST_INFLATION))
             for ratio in (noise.slopes, noise.means)

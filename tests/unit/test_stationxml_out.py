@@ -10,14 +10,14 @@ import pytest
 
 from agent.core.past import KnownPast
 from agent.export.past import SensorPast
-from agent.export.samples import Content, ExportError
-from agent.export.stationxml import Place, write_stationxml
+from agent.export.samples import ExportError, RecordedContent
+from agent.export.stationxml import StationPlace, write_stationxml
 from calib.estimate.correction import Law
 from calib.state.past import Past
 from tests.unit.recorded_bench import EPOCH_NS
 
 pytest.importorskip("obspy", reason="ObsPy is not installed (extra seismic)")
-PLACE = Place(47.5, 8.25, 412.0)
+PLACE = StationPlace(47.5, 8.25, 412.0)
 HOUR_NS = 3600 * 10**9
 
 
@@ -44,7 +44,7 @@ def past_of(device: str, days: dict[float, Law], windows: tuple[int, ...], unit:
 def written(path: Path, *found: SensorPast, unit: str = "count", rate_hz: float = 200.0, site: str = "site") -> Any:
     from obspy import read_inventory
 
-    write_stationxml(path, Content("mems", unit, 3), found, site=site, rate_hz=rate_hz, place=PLACE)
+    write_stationxml(path, RecordedContent("mems", unit, 3), found, site=site, rate_hz=rate_hz, place=PLACE)
     checked(path)
     return read_inventory(path)
 
@@ -116,7 +116,8 @@ def test_what_is_not_known_has_no_sensitivity(tmp_path: Path) -> None:
     assert "Sxx is not known" in channel.comments[0].value
     with pytest.raises(ExportError, match=r"mems has no past: no window was taken"):
         write_stationxml(
-            tmp_path / "b.xml", Content("mems", "count", 3), [SensorPast("mems", "A", None, why="no window was taken")],
+            tmp_path / "b.xml", RecordedContent("mems", "count", 3),
+            [SensorPast("mems", "A", None, why="no window was taken")],
             site="", rate_hz=1.0, place=PLACE,
         )  # fmt: skip
     assert not (tmp_path / "b.xml").exists()

@@ -15,21 +15,21 @@ import pytest
 
 from agent.core.events import CalibrationUpdate, StatusChange
 from agent.core.memory import MOST_MEMORIES, Memory
-from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.delivery.store import UNKEPT_MAX, WAITING_MAX, Store
 
 
-def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: object) -> Record:
+def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: object) -> StoredResult:
     given = {"run_id": "run-1", "payload": b'{"sequence":%d}' % sequence, "t_utc_ns": sequence, "recorded": True}
     given |= {"recording": "fieldcal-000001.mcap", "identity": ""} | fields
-    return Record(sequence=sequence, sensor=sensor, what=what, **given)  # type: ignore[arg-type]
+    return StoredResult(sequence=sequence, sensor=sensor, what=what, **given)  # type: ignore[arg-type]
 
 
-def status(sequence: int, value: str, sensor: str = "mems") -> Record:
+def status(sequence: int, value: str, sensor: str = "mems") -> StoredResult:
     return record(sequence, "status", sensor, payload=b'{"status":"%s"}' % value.encode())
 
 
-def sequences(records: list[Record]) -> list[int]:
+def sequences(records: list[StoredResult]) -> list[int]:
     return [r.sequence for r in records]
 
 
@@ -113,12 +113,12 @@ def test_record_of_a_result_says_whether_it_is_recorded_and_has_null_for_nan() -
         method="m", uncertainty_kind="type A, white", windows=1, residual_sd=[0.0] * 3, output_unit="count",
         identity="A",
     )  # fmt: skip
-    kept = Record.of(update, recorded=False, recording="")
+    kept = StoredResult.of(update, recorded=False, recording="")
     assert (kept.what, kept.identity, kept.sequence, kept.t_utc_ns) == ("calibration", "A", 4, 5)
     assert kept.fields["recorded"] is False
     assert kept.fields["sensitivity"][0] == [None] * 3
     change = StatusChange(run_id="r", sequence=5, sensor="mems", t_utc_ns=6, status="VALID", before="HELD", reason="")
-    assert Record.of(change, recorded=True, recording="f").what == "status"
+    assert StoredResult.of(change, recorded=True, recording="f").what == "status"
 
 
 def test_numbers_go_on_over_runs_and_jump_after_a_run_that_did_not_close(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from agent.delivery.history import FILE_NAME, History, Record, StoreError
+from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.delivery.store import Store
 from tests.unit.results import calibration, status, window
 
@@ -29,7 +29,7 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
         window(1), calibration(2, identity="A"), status(3), window(4), calibration(5, identity="A"),
         status(6, "UNCALIBRATED"), calibration(7, identity="B"), status(8),
     ]  # fmt: skip
-    store.commit([Record.of(r, recorded=True, recording="fieldcal-000001.mcap") for r in results])
+    store.commit([StoredResult.of(r, recorded=True, recording="fieldcal-000001.mcap") for r in results])
     store.mark_published(6)
     store.mark_file(1)
     store.close()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from agent.core.events import Result
-from agent.delivery.history import FILE_NAME, History, Record
+from agent.delivery.history import FILE_NAME, History, StoredResult
 from agent.delivery.store import UNKEPT_MAX, Store
 from agent.recording.files import RecordingFile, recordings
 from agent.recording.scan import scan
@@ -25,16 +25,16 @@ def recorded(directory: Path) -> list[Result]:
     return [result for _, _, results in run for result in results]
 
 
-def kept(store: Store) -> list[Record]:
+def kept(store: Store) -> list[StoredResult]:
     with History(store.path) as history:
         return history.after(0, limit=1000)
 
 
-def plain(result: Result) -> Record:
-    return Record.of(result, recorded=True, recording="")
+def plain(result: Result) -> StoredResult:
+    return StoredResult.of(result, recorded=True, recording="")
 
 
-def payloads(records: list[Record]) -> list[object]:
+def payloads(records: list[StoredResult]) -> list[object]:
     return [record.fields for record in records]
 
 
@@ -130,7 +130,7 @@ def test_marks_are_those_that_the_newest_file_names(tmp_path: Path) -> None:
     for number, event in enumerate(events):
         results = pipeline.step(event)
         recorder.record(number, event, results)
-        store.commit([Record.of(r, recorded=True, recording="fieldcal-000001.mcap") for r in results])
+        store.commit([StoredResult.of(r, recorded=True, recording="fieldcal-000001.mcap") for r in results])
     published = store.last_sequence() - 1
     store.mark_published(published)
     recorder.record(len(events), run_start(pipeline, len(events), recorder.next_file_sequence), [])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.delivery.history import History, Record, Removed
+from agent.delivery.history import History, Removed, StoredResult
 from agent.delivery.retention import DAY_NS, FOR_EACH_NEW, KeepResults
 from agent.delivery.store import Store
 from tests.unit.test_store import record, sequences, status
@@ -15,7 +15,7 @@ from tests.unit.test_store import record, sequences, status
 NOW_NS = 1_800_000_000 * 1_000_000_000
 
 
-def results(first: int, count: int, age_days: float, what: str = "window", **fields: object) -> list[Record]:
+def results(first: int, count: int, age_days: float, what: str = "window", **fields: object) -> list[StoredResult]:
     t_utc_ns = NOW_NS - int(age_days * DAY_NS)
     return [record(n, what, t_utc_ns=t_utc_ns, **fields) for n in range(first, first + count)]
 
@@ -26,7 +26,7 @@ def kept(store: Store) -> list[int]:
         return sequences(history.after(0, limit=10_000))
 
 
-def filled(tmp_path: Path, keep: KeepResults, *batches: Sequence[Record], published: int = 10_000) -> Store:
+def filled(tmp_path: Path, keep: KeepResults, *batches: Sequence[StoredResult], published: int = 10_000) -> Store:
     store = Store(tmp_path, 0, keep)
     for batch in batches:
         store.commit(batch)

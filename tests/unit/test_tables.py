@@ -12,7 +12,7 @@ from agent.calibrate.poses import PosesFile
 from agent.calibrate.tables import read_reference, read_sensor
 from agent.reading import lines
 from agent.reading.source import TableError
-from calib.recorded.poses import PoseInterval, Setting, intervals_of
+from calib.recorded.poses import PoseInterval, PoseSettings, intervals_of
 
 HEADER = "time_s,vx,vy,vz\n"
 
@@ -138,10 +138,10 @@ def test_a_reference_must_be_one_thing(tmp_path: Path, header: str) -> None:
         read_reference(write(tmp_path, header + "\n" + ",".join("1" for _ in header.split(",")) + "\n"))
 
 
-UNIAXIAL = Setting(reference_channels=1)
+UNIAXIAL = PoseSettings(reference_channels=1)
 
 
-def read_poses(path: Path, setting: Setting) -> list[PoseInterval]:
+def read_poses(path: Path, setting: PoseSettings) -> list[PoseInterval]:
     read = PosesFile(path)
     assert read.poses is not None
     with as_table_error(read.line):
@@ -171,7 +171,7 @@ def test_who_feels_gravity(tmp_path: Path) -> None:
     rest = write(tmp_path, "start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n", "rest.csv")
 
     def gravity(path: Path, **setting: object) -> list[float]:
-        return read_poses(path, Setting(**setting))[0].pose.gravity_mps2.tolist()  # type: ignore[arg-type]
+        return read_poses(path, PoseSettings(**setting))[0].pose.gravity_mps2.tolist()  # type: ignore[arg-type]
 
     assert gravity(clamp, coupling="ac") == [0, 0, 0]
     np.testing.assert_allclose(gravity(clamp, static_sign=-1, gravity_mps2=9.7), [0, 9.7, 0], atol=1e-14)
@@ -208,19 +208,21 @@ def test_who_feels_gravity(tmp_path: Path) -> None:
         ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n", UNIAXIAL, r"line 2: gx,gy,gz alone is a static position"),
         (
             "start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n",
-            Setting(reference_channels=0, coupling="ac"),
+            PoseSettings(reference_channels=0, coupling="ac"),
             "line 2: an AC-coupled",
         ),
-        ("start_s,stop_s,axis\n0,1,x\n", Setting(reference_channels=0), r"line 2: .*--reference is needed"),
+        ("start_s,stop_s,axis\n0,1,x\n", PoseSettings(reference_channels=0), r"line 2: .*--reference is needed"),
         (
             "start_s,stop_s,axis\n0,1,x\n",
-            Setting(reference_channels=3),
+            PoseSettings(reference_channels=3),
             r"line 2: a tri-axial reference measures the direction itself",
         ),
-        ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n", Setting(reference_channels=3), r"line 2: .* needs --rotation"),
+        ("start_s,stop_s,gx,gy,gz\n0,1,0,0,9.8\n", PoseSettings(reference_channels=3), r"line 2: .* needs --rotation"),
     ],
 )
-def test_a_fault_of_poses_is_named_with_its_place(tmp_path: Path, text: str, setting: Setting, message: str) -> None:
+def test_a_fault_of_poses_is_named_with_its_place(
+    tmp_path: Path, text: str, setting: PoseSettings, message: str
+) -> None:
     path = write(tmp_path, text, "poses.csv")
     with pytest.raises(TableError, match=message) as error:
         read_poses(path, setting)

@@ -13,8 +13,8 @@ import pytest
 from agent.core import streams
 from agent.core.events import CalibrationUpdate, ClockReport, Event, Result, StatusChange, WindowReport
 from agent.core.pipeline import Pipeline
-from agent.core.schedule import Piece
-from agent.core.windows import Found, windows_in
+from agent.core.schedule import PosePiece
+from agent.core.windows import StretchWindows, windows_in
 from benchmarks.online.node import Node, Stated, Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, opened, visits
 from hw.block import BlockFlags, SampleBlock
@@ -70,7 +70,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     """How many times the windows of each visit were made; they are made as ever."""
     counts: Counter[int] = Counter()
 
-    def counted(piece: Piece, *args: Any) -> Found:
+    def counted(piece: PosePiece, *args: Any) -> StretchWindows:
         counts[int(piece.start_s // TIMING.every_s)] += 1
         return windows_in(piece, *args)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.estimate.rows import Noise
+from calib.estimate.rows import NoiseScores
 from calib.windows.record import Record
 from calib.windows.type_a import LEVELS, SUMS, scattered, score_sums
 from tests.building_windows import building_window
@@ -44,7 +44,7 @@ def test_a_variance_with_the_covariance_of_neighbours_has_fewer_degrees_of_freed
 
 def test_where_no_segments_tell_it_slopes_and_means_scatter_as_white_noise_makes_them() -> None:
     nothing = replace(Record.of(building_window(np.random.default_rng(3), level_mps2=LEVEL), 0.0), scores=NO_SCORES)
-    *_, pooled = Noise.around([nothing, nothing])
+    *_, pooled = NoiseScores.around([nothing, nothing])
     assert (pooled.slopes, pooled.means, pooled.degrees_of_freedom) == (1.0, 1.0, 0.0)
 
 
@@ -53,7 +53,7 @@ def test_the_noise_of_a_window_is_that_of_its_points() -> None:
     own = Record.of(building_window(random, level_mps2=LEVEL, noise_mps2=0.02), 0.0)
     np.testing.assert_allclose(own.noise, 0.02, rtol=0.05)  # 3000 points: 1.3 % is one standard deviation
     # Segments move by their own part of the motion; what is left of them scatters as white noise does.
-    (pooled,) = Noise.around([own])
+    (pooled,) = NoiseScores.around([own])
     assert 0.5 < pooled.means < 1.5
     assert 0.5 < pooled.slopes < 1.5
 

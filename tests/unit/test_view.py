@@ -13,9 +13,9 @@ from rich.console import Console
 from agent.core.events import Gap
 from agent.delivery.publication import PublicationState
 from agent.terminal.quantity import counted, duration, size
-from agent.terminal.screen import Picture, Screen
+from agent.terminal.screen import Screen, ScreenPicture
 from agent.terminal.state import DeviceState, RecordingState, ViewState
-from agent.terminal.view import Lines, open_view
+from agent.terminal.view import LineView, open_view
 from agent.terminal.wording import gap_line, truth_line
 from calib.rounding import from_to, plus_minus
 from tests.unit.results import calibration, status, window
@@ -47,7 +47,7 @@ def full_state(windows: int = 9) -> ViewState:
 def picture(state: ViewState, width: int, height: int) -> list[str]:
     console = Console(width=width, height=height, file=io.StringIO(), color_system=None)
     with console.capture() as capture:
-        console.print(Picture(state))
+        console.print(ScreenPicture(state))
     return capture.get().splitlines()
 
 
@@ -130,7 +130,7 @@ def test_lines_tell_each_thing_once() -> None:
     stream = io.StringIO()
     state = full_state(2)
     view = open_view(state, stream)
-    assert isinstance(view, Lines)
+    assert isinstance(view, LineView)
     for _ in range(3):
         view.refresh()
     state.devices["reference"].state = "open"

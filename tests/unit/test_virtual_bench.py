@@ -11,7 +11,7 @@ from agent.cli.main import run_cli
 from agent.cli.run import lateness_s, virtual_bench
 from agent.core.events import Gap
 from agent.core.identity import identity_of
-from agent.terminal.watch import Watch
+from agent.terminal.watch import RunView
 from hw.sensor import load_driver
 
 
@@ -39,7 +39,7 @@ def test_a_slow_computer_gets_devices_of_250_hz_and_gaps_are_told_with_their_cau
         assert [device.options["rate_hz"] for device in config.devices] == [250.0, 250.0]
         gap = Gap(device="mems", t_monotonic_ns=0, dropped=36, unit="bytes", reason="FIFO overrun while it was read")
         for known in (truth, None):
-            with Watch(config, "bench", known) as watch:
+            with RunView(config, "bench", known) as watch:
                 for _ in range(3):
                     watch.update(gap, [])
     told = [line for line in capsys.readouterr().out.splitlines() if "slow" in line or "dropped" in line]

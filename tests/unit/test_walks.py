@@ -16,7 +16,7 @@ from calib.estimate.statements import Widening
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array
 from calib.state.state import State
-from calib.state.walks import Shown, Walks
+from calib.state.walks import ReferenceView, Walks
 from calib.windows.record import Record
 from tests.building_windows import building_window
 
@@ -29,9 +29,9 @@ RATE = 0.05  # false alarms a year
 THRESHOLD = 11.2
 
 
-def seen(day: float, value: Array, *makers: str) -> Shown:
+def seen(day: float, value: Array, *makers: str) -> ReferenceView:
     by_parameter = [dict.fromkeys((f"S{p}", *makers), (1.0, WALK**2)) for p in range(12)]
-    return Shown(day, value, ZERO, ZERO, WALK**2 * ONES, ZERO, ZERO, by_parameter, True)
+    return ReferenceView(day, value, ZERO, ZERO, WALK**2 * ONES, ZERO, ZERO, by_parameter, True)
 
 
 def told(walks: Walks, courses: Mapping[str, Array], first: int = 0) -> list[tuple[int, DriftVerdict]]:

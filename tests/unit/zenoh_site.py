@@ -13,7 +13,7 @@ import msgspec
 import zenoh
 
 from agent.delivery.consumer import Consumer, Received
-from agent.delivery.history import Record
+from agent.delivery.history import StoredResult
 from agent.delivery.router import open_router
 from agent.delivery.session import session_config
 from tests.unit.results import calibration, clock, status, window
@@ -48,11 +48,11 @@ class Site:
         return zenoh.open(session_config("client", connect=[self.endpoint]))
 
 
-def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: Any) -> Record:
+def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: Any) -> StoredResult:
     """A result; `fields` are added to its payload."""
     whole = {"window": window, "calibration": calibration, "status": status, "clock": clock}[what](sequence)
     payload = {**msgspec.structs.asdict(whole), "sensor": sensor, "recorded": True, **fields}
-    return Record(sequence, "run-1", sensor, what, msgspec.json.encode(payload), 1000 + sequence, True, "f.mcap")
+    return StoredResult(sequence, "run-1", sensor, what, msgspec.json.encode(payload), 1000 + sequence, True, "f.mcap")
 
 
 def sequence_of(sample: zenoh.Sample) -> int:
