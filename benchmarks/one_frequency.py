@@ -47,12 +47,14 @@ def line(
     """A line of the table."""
     told = [f for f in found if f is not None]
     away, u, k = (np.array([f[i] for f in told]) for i in range(3))
-    z, inside = away / u, np.abs(away) <= k[:, None] * u
+    z, told_all = away / u, np.isfinite(u)  # NaN where a parameter is not determined
+    inside = (np.abs(away) <= k[:, None] * u)[told_all]
     name = f"order {order} at {corner_hz:g} Hz" if corner_hz else "none"
-    rms = [np.sqrt(np.mean(z[:, some] ** 2)) for some in (MAIN, OFFSET)]
+    rms = [np.sqrt(np.nanmean(z[:, some] ** 2)) for some in (MAIN, OFFSET)]
     return (
         f"| {motion_hz:g} | {name} | {len(found) - len(told)} of {len(found)} | {100.0 * u[:, MAIN].mean():.2f} | "
-        f"{rms[0]:.2f} | {rms[1]:.2f} | {100.0 * inside.mean():.1f} | {np.abs(z).max():.1f} |"
+        f"{rms[0]:.2f} | {rms[1]:.2f} | {told_all.mean(axis=0).min():.0%} | {100.0 * inside.mean():.1f} | "
+        f"{np.nanmax(np.abs(z)):.1f} |"
     )
 
 
@@ -63,8 +65,9 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     lines = [
-        "| motion, Hz | filter | refused | u of main S, % | RMS of error / u: main S | Q | all within U, % | most, u |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| motion, Hz | filter | refused | u of main S, % | RMS of error / u: main S | Q | "
+        "least determined | all within U, % | most, u |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     with multiprocessing.Pool() as pool:
         for motion_hz, corner_hz, order in LINES:

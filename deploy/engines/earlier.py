@@ -69,6 +69,8 @@ REVISIONS = (
     # The last before held windows are explained by what an explanation gains beyond chance, and before transverse
     # sensitivities of a reference.
     Revision(15, "d84dd71c851d", "0.2.0"),
+    # The last before noise and rounding of a tri-axial reference beside one tone were taken for motion.
+    Revision(16, "bda75986f69f", "0.3.0"),
 )
 
 
