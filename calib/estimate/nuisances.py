@@ -32,7 +32,7 @@ from calib.signal.response import FLAT, NO_MOTION, Response, ResponseModel
 RESPONSE_U = 10.0
 # Of ln |h| at one frequency: what resonances at 30 times this frequency add, which cause hardly a lag; the most that
 # a lag says, because clocks that differ cause larger lags than filters do.
-ATTENUATED_U, MOST_ATTENUATED = 1e-3, 0.15
+ATTENUATED_U, MOST_ATTENUATED = 1e-3, 0.1
 
 
 @dataclass(frozen=True, init=False)
@@ -129,12 +129,13 @@ class Priors(StatedValues):
 
         One frequency cannot tell how much an instrument's filter attenuates it. A causal low-pass filter that delays by
         L attenuates by nothing if it is a pure delay, and by (omega L)^2 / 2 if it is of first order; others lie
-        between these two, and most of them near one end. Therefore the prior is U-shaped (arc sine; JCGM 101, 6.4.6).
+        between these two, most of them near one end. The prior has its mean in the middle of both, and the ends at one
+        standard uncertainty.
         """
         late_s = lag_s - self.lag_at_s
         most = min(0.5 * (2.0 * np.pi * motion_hz * late_s) ** 2, MOST_ATTENUATED)
         attenuated = 0.5 * most * float(np.sign(late_s))  # a reference that comes late is the one that attenuates
-        u = float(np.hypot(np.sqrt(0.125) * most, ATTENUATED_U))
+        u = float(np.hypot(0.5 * most, ATTENUATED_U))
         if (u_known := float(np.hypot(self.known.u_size(motion_hz), ATTENUATED_U))) < u:
             u, attenuated = u_known, 0.0
         at_hz = self.reference_frequency_hz or motion_hz

@@ -190,7 +190,7 @@ def test_too_few_rests_are_refused(tmp_path):
 def test_the_table_ends_with_s_q_the_band_and_the_three_largest_sources(session):
     lines = _run(session).stdout.splitlines()
     told = _told(_run(session, "--json", "-"))
-    at = lines.index("  largest sources         U(Szz)  U(Qz)  smaller with")
+    at = lines.index("  largest sources          U(Szz)  U(Qz)  smaller with")
     assert len(lines) == at + 4
     assert [line.split()[0] for line in lines[at - 6 : at - 3]] == ["x", "y", "z"]
     assert lines[at - 2].startswith("  S holds at 3 Hz; from ")
@@ -202,7 +202,7 @@ def test_the_table_ends_with_s_q_the_band_and_the_three_largest_sources(session)
         for name, part in budget.items()
     }  # fmt: skip
     largest = sorted(shares, key=lambda name: -shares[name])[:3]
-    ways = ("--u-transverse-motion-pct", "--u-gravity-mps2", "--u-offset-mps2")
+    ways = ("--u-transverse-motion-pct", "--u-gravity-mps2", "--sensor-filter, --reference-filter")
     for line, name, way in zip(lines[at + 1 :], largest, ways, strict=True):
         assert line.startswith(f"  {name} ")
         assert line.endswith(way)
