@@ -22,6 +22,8 @@ from agent.delivery.keys import CHUNK, Address
 from calib.model import PARAMETERS
 
 NEEDS_A_PERSON = ("INVALID", "HELD", "UNCALIBRATED")
+WITNESSES = ("VALID", "HELD", "RECALIBRATING")  # of a sensor whose windows are compared with its calibration
+ON_HOLD = "put on hold by "  # as agent.core.gate says it
 CALM = ("running", "catching up")  # states of a gateway that need no person
 LARGEST = 1e6  # change in units of U; a stranger may send numbers whose quotient is not finite
 # A stranger may invent gateways and sensors for ever. So there is a bound: ten times those of docs/fleet-evidence.md.
@@ -46,9 +48,10 @@ SINCE_STABLE = ("first_utc_ns", "drifts")
 # As calib.state.state.DATED puts the date of the certificate behind the identity of a reference.
 _CALIBRATED = re.compile(r"(.*), calibrated ([0-9]{4}-[0-9]{2}-[0-9]{2})", re.DOTALL)
 IN_TURNS = (
-    "two runs have given results the same numbers: gateways with copies of one memory card are on the bus in turns, "
-    "and some of their results are missing here; give one of them another name, data directory and key"
+    "have given results the same numbers: gateways with copies of one memory card are on the bus in turns, and some of "
+    "their results are missing here"
 )
+RUN_SHOWN = 12  # characters of the id of a run
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
 Kind = Literal["drifting", "changed", "held", "doubled", "no data", "silent", "uncalibrated", "sound"]
@@ -86,8 +89,8 @@ class Fleet:
         self._since_stable: dict[tuple[Place, str], tuple[int, bool]] = {}  # as SINCE_STABLE, by parameter
         self._alive: set[tuple[str, str]] = set()
         self._told: dict[tuple[str, str], GatewayTold] = {}
-        self._doubled: dict[tuple[str, str], int] = {}
-        self._in_turns: set[tuple[str, str]] = set()
+        self._doubled: dict[tuple[str, str], tuple[str, ...]] = {}  # the ids of their runs
+        self._in_turns: dict[tuple[str, str], tuple[str, ...]] = {}
         self._mixed_utc_ns: dict[tuple[str, str], int] = {}  # since when gateways are in one of the two
         self._gateways: set[tuple[str, str]] = set()
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
@@ -195,14 +198,20 @@ class Fleet:
         with self._mutex:
             return str(self._newest.get(place, {}).get("status", {}).get("status", ""))
 
-    def beside(self, place: Place) -> dict[str, int]:
-        """Of the other sensors whose newest windows had the same reference: how many there are (`count`), and how many
-        of them have a main sensitivity that drifts or stepped (`changed`)."""
+    def beside(self, place: Place, since_utc_ns: int) -> dict[str, int]:
+        """Of the other sensors whose newest windows had the same reference: how many can witness (`count`), and how
+        many of these have changed (`changed`): windows contradict them, or a main sensitivity drifts or stepped.
+
+        A witness is heard, in the name of one gateway, and has had a window since the time `since_utc_ns`.
+        """
         with self._mutex:
             own = _reference(self._newest.get(place, {}))
-            others = [n for p, n in self._newest.items() if p != place and own and _reference(n) == own]
-        changed = sum(any(v["parameter"] in _MAIN_NAMES for v in _verdicts(newest)) for newest in others)
-        return {"count": len(others), "changed": changed}
+            others = [
+                newest for other, newest in self._newest.items()
+                if other != place and own and _reference(newest) == own and self._hears(other)
+                and _window_utc_ns(newest) > since_utc_ns and _judges(newest)
+            ]  # fmt: skip
+        return {"count": len(others), "changed": sum(map(_has_changed, others))}
 
     def peers(self, place: Place, most: int) -> list[Place]:
         """At most so many other sensors of the same kind of device (the first word of the identity)."""
@@ -235,13 +244,13 @@ class Fleet:
             self.version += 1
             self._touch_gateway((site, gateway))
 
-    def set_doubled(self, doubled: Mapping[str, int], in_turns: Collection[str] = ()) -> None:
-        """The gateways (`<site>/<gateway>`) of which more than one is on the bus, with their numbers, and those in
-        whose name two gateways publish in turns."""
-        found, turns = {_place(source): count for source, count in doubled.items()}, set(map(_place, in_turns))
+    def set_doubled(self, doubled: Mapping[str, Sequence[str]], in_turns: Mapping[str, Sequence[str]]) -> None:
+        """The gateways (`<site>/<gateway>`) of which more than one is on the bus, and those in whose name two gateways
+        publish in turns; each with the ids of the runs."""
+        found, turns = ({_place(source): tuple(runs) for source, runs in of.items()} for of in (doubled, in_turns))
         with self._mutex:
-            changed = found.keys() ^ self._doubled.keys() | turns ^ self._in_turns
-            now_ns, mixed = self._now_ns(), found.keys() | turns
+            changed = found.keys() ^ self._doubled.keys() | turns.keys() ^ self._in_turns.keys()
+            now_ns, mixed = self._now_ns(), found.keys() | turns.keys()
             self._mixed_utc_ns = {gateway: self._mixed_utc_ns.get(gateway, now_ns) for gateway in mixed}
             self.version += (found, turns) != (self._doubled, self._in_turns)
             self._doubled, self._in_turns = found, turns
@@ -279,8 +288,8 @@ class Fleet:
             counts = Counter(place[:2] for place in self._newest)
             rows = [
                 _gateway_row(place, counts[place], place in self._alive, self._told.get(place),
-                             refused.get("/".join(place), 0), self._doubled.get(place, 1),
-                             in_turns=place in self._in_turns) | {"mixed_utc_ns": self._mixed_utc_ns.get(place)}
+                             refused.get("/".join(place), 0), self._doubled.get(place, ()),
+                             self._in_turns.get(place, ())) | {"mixed_utc_ns": self._mixed_utc_ns.get(place)}
                 for place in self._gateways | {_place(source) for source in refused}
             ]  # fmt: skip
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
@@ -296,6 +305,10 @@ class Fleet:
             row = _row(place, self._newest[place], self._state_of(gateway), heard=heard, doubled=doubled)
             self._made[place] = row | of
         return self._made[place]
+
+    def _hears(self, place: Place) -> bool:
+        """Whether results of this sensor come, from one gateway."""
+        return place not in self._silent and place[:2] in self._alive and place[:2] not in self._mixed_utc_ns
 
     def _touch(self, place: Place) -> None:
         self._changed[place] = self.version
@@ -356,6 +369,22 @@ def _reference(newest: Mapping[str, dict[str, Any]]) -> str:
     return str((newest.get("calibration", {}).get("references") or [""])[-1])
 
 
+def _window_utc_ns(newest: Mapping[str, dict[str, Any]]) -> int:
+    """The time of the newest window; 0 where there is none."""
+    return max(int(newest.get(part, {}).get("t_utc_ns", 0)) for part in ("good window", "refused window"))
+
+
+def _judges(newest: Mapping[str, dict[str, Any]]) -> bool:
+    """Whether a calibration is in force that windows are compared with, and which no operator has put on hold."""
+    status = newest.get("status", {})
+    return status.get("status") in WITNESSES and not str(status.get("reason")).startswith(ON_HOLD)
+
+
+def _has_changed(newest: Mapping[str, dict[str, Any]]) -> bool:
+    moved = any(verdict["parameter"] in _MAIN_NAMES for verdict in _verdicts(newest))
+    return moved or newest.get("status", {}).get("status") == "HELD"
+
+
 def _verdicts(newest: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     return [f for part, f in newest.items() if part.startswith("drift ") and f["verdict"] != "stable"]
 
@@ -386,6 +415,7 @@ def _row(
 ) -> dict[str, Any]:
     status, calibration = newest.get("status", {}), newest.get("calibration", {})
     verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
+    u_pct, u_axis = _largest_u(calibration)
     reference, calibrated_utc_ns = dated(_reference(newest))
     told = ["drifting" if drift["drifts"] else "stepped" for drift in verdicts]
     why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
@@ -408,7 +438,8 @@ def _row(
         "gateway_state": gateway_state,
         "verdicts": [{name: drift[name] for name in (*VERDICT, *SINCE_STABLE)} for drift in verdicts],
         "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
-        "u_pct": _u_pct(calibration),
+        "u_pct": u_pct,
+        "u_axis": u_axis,
         "band_hz": calibration.get("valid_band_hz", []),
         "calibration_utc_ns": calibration.get("t_utc_ns"),
         "reference": clipped(reference),
@@ -433,13 +464,13 @@ def dated(reference: str) -> tuple[str, int | None]:
     return found[1], int(date.timestamp()) * 10**9
 
 
-def _u_pct(calibration: Mapping[str, Any]) -> float | None:
-    """The largest U (k = 2) of a main sensitivity, in % of it; None where none is known."""
+def _largest_u(calibration: Mapping[str, Any]) -> tuple[float | None, str]:
+    """The largest U (k = 2) of a main sensitivity, in % of it, and which one it is; None and "" where none is known."""
     if not calibration:
-        return None
+        return None, ""
     values, u = calibration["sensitivity"], calibration["standard_uncertainty"]
-    found = [200.0 * u[i] / abs(s) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None]
-    return max((each for each in found if math.isfinite(each)), default=None)
+    found = [(200.0 * u[i] / abs(s), PARAMETERS[i]) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None]
+    return max((each for each in found if math.isfinite(each[0])), default=(None, ""))
 
 
 def _gateway_row(
@@ -448,15 +479,14 @@ def _gateway_row(
     alive: bool,
     told: GatewayTold | None,
     refused: int,
-    instances: int,
-    *,
-    in_turns: bool,
+    doubled: Sequence[str],
+    in_turns: Sequence[str],
 ) -> dict[str, Any]:
     why = [] if alive else ["the gateway is not on the bus"]
-    if instances > 1:
-        why.append(f"{instances} gateways are on the bus under this name: stop one of them, or give it another name")
+    if doubled:
+        why.append(f"{len(doubled)} gateways are on the bus under this name ({_runs(doubled)})")
     elif in_turns:
-        why.append(IN_TURNS)
+        why.append(f"{_runs(in_turns)} {IN_TURNS}")
     if told is not None and told.state not in CALM:
         why.append(clipped(f"{told.state}: {'; '.join(told.reasons[:10])}"))
     if refused:
@@ -470,9 +500,14 @@ def _gateway_row(
         "version": clipped(told.version) if told else "",
         "told_utc_ns": told.t_utc_ns if told else None,
         "refused": refused,
-        "instances": instances,
+        "instances": max(len(doubled), 1),
         "why": "; ".join(why),
     }
+
+
+def _runs(ids: Sequence[str]) -> str:
+    """The runs of gateways with one name; the log of each says its own when it begins."""
+    return f"runs {', '.join(run[:RUN_SHOWN] for run in ids)}"
 
 
 def clipped(text: str) -> str:

@@ -233,8 +233,7 @@ class Following:
             if self._hearing.lost():
                 consumer.close()  # then both sessions are opened anew
                 return
-            doubled = {source: len(instances) for source, instances in consumer.doubled.items()}
-            self._fleet.set_doubled(doubled, consumer.in_turns)
+            self._fleet.set_doubled(consumer.doubled, consumer.in_turns)
 
     def _take_token(self, token: zenoh.Sample) -> None:
         if (address := parse_key(str(token.key_expr))) is not None:

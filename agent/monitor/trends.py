@@ -20,6 +20,7 @@ THINNED = 60  # points of a small plot
 POINTS = 400  # of the history to which a change is fitted
 YEAR_DAYS = 366
 KEPT_FOR_S, KEPT_MAX = 60.0, 2000  # for so long, and of so many sensors, what was found is used again
+SECOND_NS = 1_000_000_000  # a window is longer
 STATUSES = 200  # changes of status that are looked at
 WINDOWS = 400  # windows among which those that are held are looked for, the newest
 ESTIMATES = 12  # that are shown beyond the calibration in force
@@ -40,7 +41,8 @@ class Trends:
         """`t_utc_ns` (n) and `main_pct` (3, n): a year of the main sensitivities as changes since the calibration of
         `accepted_utc_ns`; `changes`: of each parameter its change and U of that; `budget`: what makes u of the main
         sensitivities (3), by source; `found`: of each verdict what the history tells; `held_utc_ns`: since when the
-        status is what it is; `adopted_utc_ns`: when a jump last came into force since then; `beside`: Fleet.beside.
+        status is what it is; `adopted_utc_ns`: when a jump last came into force since then; `beside`: Fleet.beside,
+        since the change began or the sensor is held.
         Where the status is HELD also `refused_utc_ns`: when a window since then was not used, thinned; and `estimates`:
         the newest ones after the calibration in force, each with `t_utc_ns`, `main_pct` (3), `values` and `u` (12).
 
@@ -66,6 +68,10 @@ class Trends:
         first, last = from_then[0], history[-1]
         ends = self._with_budget(place, first), self._with_budget(place, last)
         held = _lasting(statuses) if statuses and statuses[-1]["status"] == "HELD" else None
+        windows = self._database.history(*place, "window", WINDOWS) if verdicts or held is not None else []
+        fitted = sorted([c["t_utc_ns"] for c in history] + [w["t_utc_ns"] for w in windows if w["used"]])
+        found = {v["parameter"]: _trend(v, from_then, ends, fitted) for v in verdicts}
+        begun = [trend["began_utc_ns"][0] for trend in found.values()] + ([] if held is None else [held])
         year = [c for c in history if c["t_utc_ns"] > last["t_utc_ns"] - YEAR_DAYS * DAY_NS]
         shown = [year[k] for k in _thinned(len(year))]
         return {
@@ -80,15 +86,19 @@ class Trends:
                 (t for s in statuses if _adopts(s) and (t := s["t_utc_ns"]) >= accepted), default=None
             ),
             "certificate_utc_ns": _certificate_since(history),
-            "found": {v["parameter"]: _trend(v, from_then, ends) for v in verdicts},
-            "beside": self._fleet.beside(place),
-        } | ({} if held is None else self._beyond(place, held, first, last))
+            "found": found,
+            "beside": self._fleet.beside(place, min(begun, default=0)),
+        } | ({} if held is None else self._beyond(place, held, first, last, windows))
 
     def _beyond(
-        self, place: Place, held_utc_ns: int, first: Mapping[str, Any], last: Mapping[str, Any]
+        self,
+        place: Place,
+        held_utc_ns: int,
+        first: Mapping[str, Any],
+        last: Mapping[str, Any],
+        windows: Sequence[Mapping[str, Any]],
     ) -> dict[str, Any]:
         """What a sensor that is held says beyond its calibration in force, the `last` one."""
-        windows = self._database.history(*place, "window", WINDOWS)
         refused = [w["t_utc_ns"] for w in windows if not w["used"] and w["t_utc_ns"] >= held_utc_ns]
         told = [e["calibration"] for e in self._database.history(*place, "estimate", ESTIMATES)]
         return {
@@ -180,12 +190,28 @@ def change_in(days: Array, values: Array, verdict: Mapping[str, Any]) -> tuple[S
     return (other, instead) if own is None or instead.squares < 0.5 * own.squares else (told, own)
 
 
+def _began(verdict: Mapping[str, Any], shape: Shape, change: Since | None, fitted: Sequence[int]) -> tuple[int, int]:
+    """Between which times (UTC, ns) a change began: the last window without it, from which on values are uncertain, and
+    the first one with it.
+
+    The agent tells the first window of a step. The history of S and Q in force does not: they follow a step when it is
+    adopted. Elsewhere the onset of the history counts, with its U.
+    """
+    if change is None or shape == verdict["verdict"] == "stepped":
+        onset: int = verdict["onset_utc_ns"]
+        return max((t for t in fitted if t < onset - SECOND_NS), default=onset), onset
+    return round((change.day - 2 * change.u_day) * DAY_NS), round((change.day + 2 * change.u_day) * DAY_NS)
+
+
 def _trend(
     verdict: Mapping[str, Any],
     history: Sequence[Mapping[str, Any]],
     ends: tuple[Mapping[str, Any], Mapping[str, Any]],
+    fitted: Sequence[int],
 ) -> dict[str, Any]:
     """The parameter of a verdict over time, and the `change` that its history shows; None where it shows none.
+
+    `began_utc_ns` (2): between which times it began (`_began`); `fitted`: times of windows that fitted, rising.
 
     The values of a history lie on a smooth line even where all of them are wrong: a drift that the agent does not know
     yet makes them late. So u of size and rate contain that of the change from the first to the last one, the `ends`.
@@ -196,17 +222,19 @@ def _trend(
     days, values = np.array(t_utc_ns, dtype=float) / DAY_NS, np.array([v for _, v, _ in known])
     rising = np.append(True, np.diff(days) > 0) if len(days) else np.zeros(0, dtype=bool)
     shape, change = change_in(days[rising], values[rising], verdict)
-    thin = _thinned(len(known))
+    began, thin = _began(verdict, shape, change, fitted), _thinned(len(known))
     u_between = 0.5 * (change_of(*ends, i)["U"] or 0.0)
     u_a_day = u_between / max(float(days[-1]) - change.day, 1.0) if change and change.rate else 0.0
     return {
         "t_utc_ns": [known[k][0] for k in thin],
         "values": [known[k][1] for k in thin],
         "u": [known[k][2] for k in thin],
+        "began_utc_ns": began,
         "scale": value_of(history[-1], 4 * (i // 3 if i < 9 else i - 9)),  # the main sensitivity of its output
         "change": change
         and {
-            "shape": shape, "onset_utc_ns": round(change.day * DAY_NS), "u_onset_days": change.u_day,
+            "shape": shape, "onset_utc_ns": began[1] if shape == "stepped" else round(change.day * DAY_NS),
+            "u_onset_days": change.u_day,
             "size": change.size, "u_size": math.hypot(change.u_size, u_between), "rate": change.rate,
             "u_rate": math.hypot(change.u_rate, u_a_day),
         },

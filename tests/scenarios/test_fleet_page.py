@@ -73,7 +73,8 @@ def assert_the_five_questions_are_answered(shown: PageSite, page: Any) -> None:
     stepped, since = of("stepped")
     assert stepped["kind"] == "held"
     assert since in stepped["say"]
-    assert "Explained best by another " in stepped["more"]
+    assert "Three explanations fit about equally: another reference drift along z" in stepped["more"]
+    assert " other sensors with the same reference are steady: " in stepped["more"]
     assert "fieldcal command accept" in stepped["next"] or "Correct it" in stepped["next"]
     held, since = of("held")
     assert held["kind"] == "held"

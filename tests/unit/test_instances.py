@@ -87,6 +87,7 @@ def test_copies_that_are_on_the_bus_in_turns_are_told_and_a_restart_is_not(site:
         assert "copies of one memory card" not in why()
         assert publish("copy", "another") < last  # its store has never heard of these numbers
         wait_for(lambda: "copies of one memory card" in why())
+        assert "; runs one, another have given" in why()
 
 
 def test_a_copied_card_is_told_to_the_second_gateway_to_consumers_and_on_the_page(
@@ -113,7 +114,8 @@ def test_a_copied_card_is_told_to_the_second_gateway_to_consumers_and_on_the_pag
         second = opened.enter_context(closing(Gateway(site, tmp_path / "copy")))
         wait_for(lambda: second.fault.startswith("2 gateways are on the bus as site/gw (runs "))
         wait_for(lambda: [len(found) for found in consumer.doubled.values()] == [2])
-        words = "2 gateways are on the bus under this name: stop one of them, or give it another name"
+        [runs] = consumer.doubled.values()  # the log of each gateway says its own
+        words = f"2 gateways are on the bus under this name (runs {runs[0][:12]}, {runs[1][:12]})"
         wait_for(lambda: told() == [(2, words)])
         assert (notices(), notices()) == (["more than one gateway is on the bus under this name"], [])
         first.close()

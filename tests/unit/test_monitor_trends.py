@@ -139,13 +139,14 @@ def test_a_sensor_that_is_held_and_has_stepped_is_held() -> None:
     assert [v["verdict"] for v in row["verdicts"]] == ["stepped"]  # with its step
     fleet.take(*PLACE, "status", fields_of(status(2, "VALID")))
     assert kind(fleet) == "changed"  # an adopted step needs a person too, and does not drift
-    fleet.set_doubled({"site/gw": 2})
+    fleet.set_doubled({"site/gw": ("a1", "b2")}, {})
     assert kind(fleet) == "doubled"  # of two gateways with one name nobody knows whose results these are
     now.ns += SECOND_NS
-    fleet.set_doubled({}, ["site/gw"])  # one of them has left, and comes back in turns
+    fleet.set_doubled({}, {"site/gw": ("a1", "b2")})  # one of them has left, and comes back in turns
     assert kind(fleet) == "doubled"
-    assert [row["mixed_utc_ns"] for row in fleet.gateways({})] == [NOW_NS]
-    fleet.set_doubled({})
+    (row,) = fleet.gateways({})
+    assert (row["mixed_utc_ns"], row["why"].split(" have")[0]) == (NOW_NS, "runs a1, b2")
+    fleet.set_doubled({}, {})
     assert kind(fleet) == "changed"
 
 
@@ -304,3 +305,54 @@ def test_when_a_jump_came_into_force(tmp_path: Path) -> None:
             assert trends.of(PLACE)["adopted_utc_ns"] == kept[1].t_utc_ns
     assert trends.of(PLACE)["adopted_utc_ns"] is None  # changes count from what was accepted later
     database.close()
+
+
+def test_a_step_began_after_the_last_window_without_it_also_where_it_was_adopted_later(tmp_path: Path) -> None:
+    """Windows ten days apart: eight sound ones, a step, and three windows later S and Q in force follow it."""
+    fleet, database = Fleet(), Database(Sqlite(tmp_path / "monitor.sqlite"), full_days=1000)
+    days = [NOW_NS - (15 - k) * 10 * DAY_NS for k in range(15)]
+
+    def take(result: Any, t_utc_ns: int, number: int, **more: Any) -> None:
+        fields = fields_of(result, t_utc_ns=t_utc_ns, sequence=number, **more)
+        database.add([Received("", Address(*PLACE, fields["what"]), number, fields, None)])
+        fleet.take(*PLACE, fields["what"], fields)
+
+    for k, t_utc_ns in enumerate(days):
+        adopted = k > 10
+        take(window(1, used=k < 8 or adopted), t_utc_ns, 10 * k + 1, what="window")
+        if k < 8 or adopted:
+            calibrated = calibration(1, sxx=26154.0 - 800.0 * adopted + k % 2)
+            take(calibrated, t_utc_ns, 10 * k + 2, what="calibration")
+    take(status(1), days[-1], 150, what="status")
+    stepped = verdict(verdict="stepped", change=-800.0, onset_utc_ns=days[8] + 1, t_utc_ns=days[11])
+    fleet.take(*PLACE, "drift", stepped)
+    found = Trends(database, fleet).of(PLACE)["found"]["Sxx"]
+    database.close()
+    assert found["change"]["onset_utc_ns"] == days[8] + 1  # the history alone has it 30 days later
+    assert list(found["began_utc_ns"]) == [days[7], days[8] + 1]
+
+
+def test_a_witness_is_heard_in_the_name_of_one_gateway_and_was_compared_since_then() -> None:
+    now = Clock()
+    fleet, since_utc_ns = Fleet(now), NOW_NS - 5 * DAY_NS
+    windows_utc_ns = {"own": NOW_NS, "steady": NOW_NS, "held": NOW_NS, "on-hold": NOW_NS, "drifts": NOW_NS,
+                      "early": NOW_NS - 6 * DAY_NS, "away": NOW_NS, "doubled": NOW_NS, "silent": NOW_NS}  # fmt: skip
+    reasons = {"held": ("HELD", "it contradicts"), "on-hold": ("HELD", "put on hold by anna")}
+    for gateway, t_utc_ns in windows_utc_ns.items():
+        place = "site", gateway, "mems"
+        fleet.set_alive("site", gateway, gateway != "away")
+        fleet.take(*place, "calibration", fields_of(calibration(1), references=["B12"]))
+        fleet.take(*place, "window", fields_of(window(1), t_utc_ns=t_utc_ns))
+        fleet.take(*place, "status", fields_of(status(1, *reasons.get(gateway, ("VALID", "8 windows")))))
+    fleet.take("site", "drifts", "mems", "drift", verdict())
+    fleet.set_alive("site", "away", False)
+    fleet.set_doubled({"site/doubled": ("a", "b")}, {})
+    for k in range(10):
+        now.ns += 100 * SECOND_NS
+        for gateway in windows_utc_ns.keys() - ({"silent"} if k > 2 else set()):
+            fleet.take("site", gateway, "mems", "clock", {"t_utc_ns": now.ns})
+        fleet.look()
+    own = "site", "own", "mems"
+    assert fleet.beside(own, since_utc_ns) == {"count": 3, "changed": 2}  # steady, held, drifts
+    assert fleet.beside(own, NOW_NS - 7 * DAY_NS) == {"count": 4, "changed": 2}  # early too
+    assert fleet.beside(own, NOW_NS) == {"count": 0, "changed": 0}

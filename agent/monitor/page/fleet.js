@@ -78,7 +78,8 @@ function showCards(sensors, gateways, filter) {
   if (!order || asked !== orderFor || nobodyLooks()) { order = sensors.length ? best : null; orderFor = asked; }
   const keys = order ?? [], come = best.filter((key) => !keys.includes(key)).length, over = keys.filter((key) => !known.has(key)).length;
   const differs = [come && `${come} new`, over && `${over} over`].filter(Boolean).join(", ");
-  put($("needs-count"), all.length ? `Needs a person: ${all.length}` : "Nothing needs a person");
+  const odd = sensors.filter((row) => wanted(row, filter) && WORST.includes(row.kind)).length, many = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
+  put($("needs-count"), all.length ? `Needs a person: ${many(all.length, "thing")}, ${many(odd, "sensor")}` : "Nothing needs a person");
   $("new-cards").hidden = !differs && best[0] === keys[0];
   put($("new-cards"), differs ? `${differs}: show` : "Another is the worst: sort");
   for (const key of keys) {
@@ -138,7 +139,7 @@ async function answer() {
 class Row {
   constructor(row) {
     const cell = (name, title) => make("div", "", { role: "cell", class: name, "data-title": title ?? null });
-    this.cells = { name: cell("name"), x: cell("curve-x"), y: cell("curve-y"), z: cell("curve-z"), change: cell("number", "change"), over: cell("number", "of U"), u: cell("number", "U"), band: cell("number", "band"), good: cell("number", "last good window"), reference: cell("reference", "reference") };
+    this.cells = { name: cell("name"), x: cell("curve-x"), y: cell("curve-y"), z: cell("curve-z"), change: cell("number", "change"), over: cell("number", "of U"), u: cell("number", "U"), band: cell("number", "band"), good: cell("number good", "last good"), reference: cell("reference", "reference") };
     this.kind = make("span");
     this.cells.name.append(this.kind, make("a", row.sensor, { href: `#${placeOf(row)}` }));
     this.element = make("div", Object.values(this.cells), { role: "row", class: "row" });
@@ -152,7 +153,7 @@ class Row {
     this.shown = row.kind;
     put(this.cells.u, finite(row.u_pct) ? `± ${two(row.u_pct)} %` : "");
     put(this.cells.band, band(row.band_hz));
-    put(this.cells.good, row.kind === "silent" ? `not heard for ${ago(row.heard_utc_ns)}` : ago(row.last_good_utc_ns, timeOf(row)));
+    put(this.cells.good, ago(row.last_good_utc_ns, timeOf(row)));
     this.row = row;
     this.refer();
   }

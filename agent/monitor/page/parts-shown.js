@@ -10,18 +10,18 @@ const noise = (k, seed) => 0.03 * Math.sin(12.9898 * (k + 1) * seed), S = 26000;
 const drift = t.map((_, k) => Math.max(0, k - 12) * 0.05 + noise(k, 1)), calm = t.map((_, k) => noise(k, 3)), step = t.map((_, k) => (k > 50 ? -3.1 : 0) + noise(k, 2));
 
 // A row of api/fleet, and what api/trends tells of its history.
-const row = (sensor, more) => ({ site: "bridge", gateway: "span-2", sensor, kind: "sound", status: "VALID", status_utc_ns: t[1], reason: "", verdicts: [], u_pct: 0.42, band_hz: [1, 18], reference: "B12 4711", calibration_utc_ns: today, last_good_utc_ns: today, heard_utc_ns: today, result_utc_ns: today, estimate: 12, estimate_utc_ns: today, ...more });
+const row = (sensor, more) => ({ site: "bridge", gateway: "span-2", sensor, kind: "sound", status: "VALID", status_utc_ns: t[1], reason: "", verdicts: [], u_pct: 0.42, u_axis: "Sxx", band_hz: [1, 18], reference: "B12 4711", calibration_utc_ns: today, last_good_utc_ns: today, heard_utc_ns: today, result_utc_ns: today, estimate: 12, estimate_utc_ns: today, ...more });
 const verdict = (parameter, kind, k, change, rate) => ({ parameter, verdict: kind, change, u_change: 26, rate, u_rate: 0.2, onset_utc_ns: t[k], t_utc_ns: t[k + 8], first_utc_ns: t[k + 8], drifts: kind === "drifting", false_alarms_a_year: 0.1 });
 const history = (main, more) => ({ t_utc_ns: t, main_pct: main, accepted: true, changes: NAMES.map((_, i) => ({ change: i === 8 ? 65 : 10, U: 26 })), beside: { count: 17, changed: 1 }, held_utc_ns: t[49], found: {}, ...more });
-const found = (v, parameter, part, u, change) => ({ [parameter]: { t_utc_ns: part, values: v.slice(0, part.length).map((pct) => S * (1 + pct / 100)), u: part.map(() => (u * S) / 200), scale: S, change } });
+const found = (v, parameter, part, u, change, begun) => ({ [parameter]: { t_utc_ns: part, values: v.slice(0, part.length).map((pct) => S * (1 + pct / 100)), began_utc_ns: begun, u: part.map(() => (u * S) / 200), scale: S, change } });
 const bent = (size, u_size) => ({ shape: "drifting", onset_utc_ns: t[12], u_onset_days: 3, size: (size * S) / 100, u_size: (u_size * S) / 200, rate: (size * S) / 23500, u_rate: (u_size * S) / 47000 });
 const estimates = t.slice(55).map((ns) => ({ t_utc_ns: ns, main_pct: [0, -9, 0], values: NAMES.map((_, i) => (i === 4 ? 0.91 * S : 0)), u: NAMES.map(() => 0.005 * S) }));
 const held = row("deck-03", { kind: "held", status: "HELD", status_utc_ns: t[49], reason: "the window contradicts the calibration; held until further windows confirm a jump", last_good_utc_ns: t[47], calibration_utc_ns: t[47] });
 const INVENTED = [
   [row("deck-07", { kind: "drifting", verdicts: [verdict("Sxx", "drifting", 12, 300, 2)] }), history([drift, calm, calm], { found: found(drift, "Sxx", t, 0.5, bent(2.4, 0.5)) })],
-  [row("deck-08", { kind: "drifting", u_pct: 3.7, verdicts: [verdict("Sxx", "drifting", 12, 300, 2)] }), history([drift, calm, calm], { found: found(drift, "Sxx", t, 3.7, bent(2.4, 3.7)) })],
-  [row("deck-04", { kind: "changed", u_pct: 3.4, verdicts: [verdict("Szz", "stepped", 40, -806, null)] }), history([calm, calm, step], { adopted_utc_ns: t[51], found: found(step, "Szz", t, 3.4, null) })],
-  [{ ...held, verdicts: [verdict("Syy", "stepped", 49, -2340, null)] }, history([calm, calm, calm], { refused_utc_ns: t.slice(49), estimates, found: found(calm, "Syy", long, 0.4, null) })],
+  [row("deck-08", { kind: "drifting", u_pct: 3.7, u_axis: "Syy", verdicts: [verdict("Sxx", "drifting", 12, 300, 2)] }), history([drift, calm, calm], { found: found(drift, "Sxx", t, 3.7, bent(2.4, 3.7)) })],
+  [row("deck-04", { kind: "changed", u_pct: 3.4, verdicts: [verdict("Szz", "stepped", 40, -806, null)] }), history([calm, calm, step], { adopted_utc_ns: t[51], found: found(step, "Szz", t, 3.4, null, [t[39], t[40]]) })],
+  [{ ...held, verdicts: [verdict("Syy", "stepped", 49, -2340, null)] }, history([calm, calm, calm], { refused_utc_ns: t.slice(49), estimates, found: found(calm, "Syy", long, 0.4, null, [t[47], t[49]]) })],
   [held, history([calm, calm, calm].map((v) => v.slice(0, 48)), { t_utc_ns: long, refused_utc_ns: t.slice(49), estimates: [] })],
   [{ ...held, reason: "put on hold by anna" }, history([calm, calm, calm].map((v) => v.slice(0, 48)), { t_utc_ns: long, refused_utc_ns: [], estimates: [] })],
   [row("tower-1", { kind: "doubled" }), {}],

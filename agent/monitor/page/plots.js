@@ -5,6 +5,8 @@ import { finite, signed } from "./format.js";
 // What is in force stays so until the next calibration.
 const stays = uPlot.paths.stepped({ align: 1 });
 
+const WORDS_ROWS = 3, WORDS_PX = 14; // rows of words above a plot with marks
+
 // A named value of page.css.
 export const named = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const colours = () => ["--x", "--y", "--z"].map(named);
@@ -50,10 +52,11 @@ export class TimePlots {
     }
     box.setAttribute("aria-label", `${one.title} over time`);
     box.replaceChildren();
+    const above = one.marks?.length ? WORDS_ROWS * WORDS_PX : 0;
     const plot = new uPlot({
       width: width(box), height: one.height, cursor: { sync: { key: "time" }, y: false }, legend: { live: true },
       axes: [axis, { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => `${signed(v, 10 * (ticks[1] - ticks[0] || 1))}${one.unit}`) }],
-      series, bands, padding: [12, 12, null, null],
+      series, bands, padding: [12 + above, 12, null, null],
       scales: { y: { range: (_, low, high) => rangeOf(one, low, high) } },
       hooks: { draw: [(made) => drawMarks(made, one.marks ?? []), (made) => drawRefused(made, one.refused ?? [])], setScale: [(made, key) => key === "x" && this.zoomed(made)] },
     }, data, box);
@@ -96,24 +99,45 @@ function rangeOf({ series, digit }, low, high) {
   return [Math.min(from - margin, -digit), Math.max(to + margin, digit)];
 }
 
-// Dashed lines with their words: where a drift or a step began, a reference was exchanged, the agent began anew.
+// Of words from `from` to `to` each, in px: the row above the plot in which none covers another; null where none is free.
+export function rowsOf(words) {
+  const rows = Array.from({ length: WORDS_ROWS }, () => []);
+  return words.map((one) => {
+    const row = rows.findIndex((there) => there.every((other) => one.to < other.from || one.from > other.to));
+    if (row >= 0) rows[row].push(one);
+    return row >= 0 ? row : null;
+  });
+}
+
+// Dashed lines, with their words above the plot: where a drift or a step began, a reference was exchanged, the agent began
+// anew. Where there is no room, the words of an alarm come first.
 function drawMarks(plot, marks) {
-  const { ctx, bbox } = plot, size = 11 * devicePixelRatio;
+  const { ctx, bbox } = plot, px = devicePixelRatio;
   ctx.save();
   ctx.setLineDash([6, 4]);
-  ctx.lineWidth = devicePixelRatio;
-  ctx.font = `${size}px system-ui, sans-serif`;
-  marks.forEach(({ t, text, alarm }, i) => {
-    const x = plot.valToPos(t, "x", true);
-    if (x < bbox.left || x > bbox.left + bbox.width) return;
-    ctx.strokeStyle = ctx.fillStyle = named(alarm ? "--bad" : "--mute");
+  ctx.lineWidth = px;
+  ctx.font = `${11 * px}px system-ui, sans-serif`;
+  const seen = marks.map((mark) => ({ ...mark, x: plot.valToPos(mark.t, "x", true) })).filter(({ x }) => x >= bbox.left && x <= bbox.left + bbox.width).sort((a, b) => Boolean(b.alarm) - Boolean(a.alarm));
+  const words = seen.map(({ x, text }) => {
+    const wide = ctx.measureText(text).width + 4 * px, from = Math.min(x, bbox.left + bbox.width - wide);
+    return { from, to: from + wide };
+  });
+  const rows = rowsOf(words), top = (row) => bbox.top - (WORDS_ROWS - row) * WORDS_PX * px;
+  seen.forEach(({ x, alarm }, i) => {
+    ctx.strokeStyle = named(alarm ? "--bad" : "--mute");
     ctx.beginPath();
-    ctx.moveTo(x, bbox.top);
+    ctx.moveTo(x, rows[i] === null ? bbox.top : top(rows[i]));
     ctx.lineTo(x, bbox.top + bbox.height);
     ctx.stroke();
-    const right = x + ctx.measureText(text).width + 8 > bbox.left + bbox.width;
-    ctx.textAlign = right ? "right" : "left";
-    ctx.fillText(text, x + (right ? -5 : 5) * devicePixelRatio, bbox.top + size * (1 + (i % 3)));
+  });
+  ctx.textAlign = "left";
+  ctx.textBaseline = "middle";
+  seen.forEach(({ text, alarm }, i) => {
+    if (rows[i] === null) return;
+    ctx.fillStyle = named("--card"); // no line crosses a word
+    ctx.fillRect(words[i].from + px, top(rows[i]), words[i].to - words[i].from - px, (WORDS_PX - 1) * px);
+    ctx.fillStyle = named(alarm ? "--bad" : "--mute");
+    ctx.fillText(text, words[i].from + 3 * px, top(rows[i]) + 0.5 * WORDS_PX * px);
   });
   ctx.restore();
 }

@@ -6,7 +6,7 @@ import { ago, AXES, band, day, finite, MAIN, moment, NAMES, plusMinus, rounded, 
 import { bars, chip, may } from "./parts.js";
 import { savePlots } from "./picture.js";
 import { boxOf, curves, TimePlots } from "./plots.js";
-import { certificate, covered, explanation, shortName, steps, timeOf, told as toldOf, unjudged } from "./words.js";
+import { cause, certificate, covered, explanation, shortName, steps, timeOf, told as toldOf, unjudged } from "./words.js";
 
 const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
 const KINDS = ["calibration", "window", "drift", "status", "estimate", "clock"];
@@ -101,7 +101,8 @@ function showMatrix(newest, row, trends) {
   const cell = (i) => {
     const U = 2 * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "", silent = over && Math.abs(change.change) > change.U && !moved.has(NAMES[i]);
     const known = newest.determined[i] ? [] : [make("small", "by the prior")];
-    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(over ? [make("small", `moved ${over}${silent ? `, ${unjudged(trends)[0]}` : ""}`, silent ? { title: unjudged(trends)[1] } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
+    const stays = moved.has(NAMES[i]) && (row.status === "HELD" || over === "0.0 U"); // windows tell a change, and S in force stays
+    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(stays ? [make("small", "not in force")] : over ? [make("small", `moved ${over}${silent ? `, ${unjudged(trends)[0]}` : ""}`, silent ? { title: unjudged(trends)[1] } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
   };
   const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
   const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);
@@ -142,8 +143,8 @@ function showHypotheses(row, statuses) {
   const told = statuses.slice(statuses.findLastIndex((s) => s.status !== "HELD") + 1).findLast((s) => explanation(s.reason)), why = row?.status === "HELD" && told ? explanation(told.reason) : null;
   $("hypotheses-card").hidden = !why;
   if (!why) return;
-  const best = why.best ? [[why.best, why.least, why.none - why.least]] : [];
-  const alike = why.alike.map((each) => [each, "as well", ""]);
+  const best = why.best ? [[make("span", cause(why.best)), why.least, why.none - why.least]] : [];
+  const alike = why.alike.map((each) => [make("span", cause(each)), "as well", ""]);
   const fit = why.best && !why.fits ? "The best is not within what chance allows. " : !why.best ? "No known explanation fits better. " : "";
   $("hypotheses").replaceChildren(table("Explanations", ["Another…", "χ²", "smaller by"], [["none: no change", why.none, ""], ...best, ...alike]),
     make("p", [`Of ${why.held} held windows, told `, moment(told.t_utc_ns), `; χ² (chi-squared) is ${why.limit} at most if an explanation is right. ${fit}Those that differ by less than 10 are not told apart. The agent states no prior odds.`], { class: "hint" }));

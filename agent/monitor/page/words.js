@@ -1,6 +1,6 @@
 // What is said of a sensor: its verdicts in sentences, what else is steady, and what a person can do.
 import { commandLine } from "./commands.js";
-import { make } from "./common.js";
+import { clean, make } from "./common.js";
 import { ago, AXES, band, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
 import { copier, spark } from "./parts.js";
 
@@ -19,17 +19,21 @@ const named = (parameter) => [parameter[0] === "Q" ? "Offset " : "Sensitivity ",
 const pair = (v, U, unit) => [make("b", `${rounded(Math.abs(v), U)}${unit}`), finite(U) ? ` (± ${two(U)}${unit})` : ""];
 const spread = (days) => (finite(days) ? ` (± ${duration(2 * days * DAY_NS)})` : "");
 
+// Between which times a change began (agent.monitor.trends): values are uncertain from the first one on.
+const beganOf = (verdict, trend) => trend?.began_utc_ns ?? [verdict.onset_utc_ns, verdict.onset_utc_ns];
+const between = ([from, to]) => (day(from).textContent === day(to).textContent ? ["on ", day(to)] : ["between ", day(from), " and ", day(to)]);
+
 // One verdict in a sentence, by the history where it shows the change, else by the verdict itself, with its date. Where U
 // is larger than the size, the change is sure all the same (by the verdict), but not its size.
 export function sentence(verdict, trend) {
   const change = trend?.change, { unit, factor } = scaled(verdict.parameter, trend?.scale), name = named(verdict.parameter);
   const of = change ?? { size: verdict.change, u_size: verdict.u_change, rate: verdict.rate, u_rate: verdict.u_rate, onset_utc_ns: verdict.onset_utc_ns };
-  const size = pair(of.size * factor, 2 * of.u_size * factor, unit), since = [day(of.onset_utc_ns), spread(of.u_onset_days)];
+  const size = pair(of.size * factor, 2 * of.u_size * factor, unit), since = [day(of.onset_utc_ns), spread(of.u_onset_days)], at = between(beganOf(verdict, trend));
   const told = change ? "." : ["; told on ", day(verdict.t_utc_ns), "."], sized = !(2 * of.u_size > Math.abs(of.size));
   const down = of.size < 0, unsure = ["It is sure that it does, but not by how much: ", ...size];
   if ((change?.shape ?? verdict.verdict) === "stepped") {
     const fell = [...name, down ? " fell" : " rose"];
-    return (sized ? [...fell, " by ", ...size, " at once, on ", ...since, "."] : [...fell, " at once, on ", ...since, ". ", ...unsure, "."]).flat();
+    return (sized ? [...fell, " by ", ...size, " at once, ", ...at, "."] : [...fell, " at once, ", ...at, ". ", ...unsure, "."]).flat();
   }
   const days = Math.abs(of.rate * factor * MONTH_DAYS) < 0.1 ? [YEAR_DAYS, "year"] : [MONTH_DAYS, "month"];
   const rate = [...pair(of.rate * factor * days[0], 2 * of.u_rate * factor * days[0], unit), ` a ${days[1]}`], falls = [...name, down ? " falls" : " rises"];
@@ -39,7 +43,7 @@ export function sentence(verdict, trend) {
 // Whether the values that a sensor measures, corrected with S and Q in force, may be used: [tone, sentence]. By status,
 // verdicts and hearing alone; U is that of the calibration in force, and holds while windows fit it.
 export function covered(row, trends) {
-  const U = finite(row.u_pct) ? [`U = ± ${two(row.u_pct)} %`, row.band_hz?.length === 2 ? ` at ${band(row.band_hz)}` : ""] : ["U is not known"];
+  const U = finite(row.u_pct) ? [`U = ± ${two(row.u_pct)} %`, ...(row.u_axis ? [" (", symbol(row.u_axis), ")"] : []), row.band_hz?.length === 2 ? ` at ${band(row.band_hz)}` : ""] : ["U is not known"];
   const good = row.last_good_utc_ns, held = trends?.held_utc_ns ?? row.status_utc_ns, last = good && (row.status !== "HELD" || good < held) ? good : held;
   const until = good ? ["Values until the last window that fitted (", day(last), ") may be used: ", ...U, ". "] : [];
   if (row.kind === "uncalibrated" || !row.calibration_utc_ns) return ["off", [make("b", "Values may not be used yet"), ": no calibration is in force."]];
@@ -50,7 +54,7 @@ export function covered(row, trends) {
     const hold = ON_HOLD.test(row.reason);
     return [hold ? "warn" : "bad", [make("b", ["Values since ", day(last), hold ? " are not checked" : " may not be used"]), hold ? ": an operator put the calibration on hold. " : ": windows contradict S and Q in force, and U does not cover it. ", ...(good ? ["Earlier ones may: ", ...U, "."] : [])]];
   }
-  const changes = row.verdicts.map((v) => [trends?.found?.[v.parameter]?.change?.onset_utc_ns ?? v.onset_utc_ns, v.first_utc_ns]), from = Math.min(...changes.map(([onset]) => onset)), told = Math.max(...changes.map(([, at]) => at)), followed = Math.max(told, trends?.adopted_utc_ns ?? 0);
+  const changes = row.verdicts.map((v) => [beganOf(v, trends?.found?.[v.parameter])[0], v.first_utc_ns]), from = Math.min(...changes.map(([begun]) => begun)), told = Math.max(...changes.map(([, at]) => at)), followed = Math.max(told, trends?.adopted_utc_ns ?? 0);
   if (changes.length && row.calibration_utc_ns < told) return ["bad", [make("b", ["Values since ", day(from), " may not be used"]), ": S and Q in force are of ", day(row.calibration_utc_ns), " and do not follow the change. Earlier ones may: ", ...U, "."]];
   const old = timeOf(row) - row.calibration_utc_ns > DAY_NS ? [" (of ", day(row.calibration_utc_ns), ")"] : [];
   const late = changes.length ? ["; S and Q follow the change. Values of ", day(from), " to ", day(followed), ", before they did, may be wrong by it"] : [];
@@ -69,10 +73,10 @@ function steady(row) {
   return names.length ? ["Steady: ", ...names.flatMap((name, i) => (i ? [", ", name] : [name])), ". "] : [];
 }
 
-// What explains it best, by the other sensors with the same reference.
-function cause(beside) {
+// What the other sensors with the same reference say of it.
+function witnessed(beside) {
   if (!beside) return "";
-  if (!beside.count) return "No other sensor has this reference: nothing here tells sensor from reference.";
+  if (!beside.count) return "No other sensor with this reference can witness: nothing here tells sensor from reference.";
   const others = `${beside.count - beside.changed} of ${beside.count} other sensors with the same reference are steady`;
   return beside.changed * 2 >= beside.count ? `Only ${others}: look at the reference first.` : `${others}: rather this sensor than its reference.`;
 }
@@ -100,7 +104,22 @@ export function explanation(reason) {
   return { held: Number(found.held), none: Number(found.none), limit: Number(found.limit), agree: found.how.startsWith("agree"), fits: found.fits === "Best fits", best: found.best ?? "", least: Number(found.least), alike, todo: found.todo };
 }
 
-const inWords = ({ best, alike, fits, least, none }) => (!best ? "No known explanation fits them better." : `${fits ? "Explained best by" : "Nearest, but not within what chance allows:"} another ${[best, ...alike].join(", or another ")}: chi-squared ${least} in place of ${none}.`);
+// "reference drift (reference_drift_z +9.96 %)" as "reference drift along z (+10 %)"; what has another form as it is.
+export function cause(told) {
+  const found = /^(?<what>.+) \((?<name>\S+) (?<size>[-+]\S+)(?<unit> .+)?\)$/.exec(told)?.groups;
+  if (!found) return [told];
+  const size = ` (${signed(Number(found.size), Math.abs(0.1 * Number(found.size)))}${(found.unit ?? "").replace("m/s2", "m/s²")})`, axis = /_([xyz])$/.exec(found.name)?.[1];
+  if (NAMES.includes(found.name)) return [found.what, " ", symbol(found.name), size];
+  return [found.what, axis ? ` along ${axis}` : "", size];
+}
+
+const COUNTS = ["", "", "Two", "Three", "Four", "Five", "Six"];
+function inWords({ best, alike, fits, least, limit }) {
+  if (!best) return ["No known explanation fits them better."];
+  const all = [best, ...alike], named = all.flatMap((each, k) => [k ? "; " : "", "another ", ...cause(each)]), chi2 = `(chi-squared ${least}, limit ${limit})`;
+  if (all.length === 1) return [fits ? "Explained best by " : "Nearest is ", ...named, fits ? ` ${chi2}.` : `, which does not fit within chance ${chi2}.`];
+  return [`${COUNTS[all.length] ?? all.length} explanations fit about equally: `, ...named, fits ? ` ${chi2}.` : `; none fits within chance ${chi2}.`];
+}
 
 const ON_HOLD = /^put on hold by/;
 
@@ -108,7 +127,7 @@ const ON_HOLD = /^put on hold by/;
 function heldWords(row, verdicts, trends) {
   const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason);
   const reason = why ? [`${why.held} windows ${why.agree ? "agree with what the calibration may have become." : "contradict the calibration."}`] : [row.reason, "."];
-  return { say: [...since, ...(verdicts.length ? verdicts.flatMap((v) => [...v, " "]) : reason)], more: why ? [inWords(why)] : verdicts.length ? reason : [] };
+  return { say: [...since, ...(verdicts.length ? verdicts.flatMap((v) => [...v, " "]) : reason)], more: [...(why ? [...inWords(why), " "] : verdicts.length ? [...reason, " "] : []), ON_HOLD.test(row.reason) ? "" : witnessed(trends?.beside)] };
 }
 
 // What is said of a sensor that is in order: its largest change of a main sensitivity, and what was adopted.
@@ -136,7 +155,7 @@ export function told(row, trends) {
   if (row.kind === "silent") return { say: ["Not heard since ", make("b", moment(row.heard_utc_ns)), ` (${duration(now() - row.heard_utc_ns)}${row.gateway_state === "silent" ? "" : ", though its gateway is on the bus"})`, ...newest, "."], more: verdicts.flatMap((v) => ["Before: ", ...v, " "]) };
   if (row.kind === "doubled") return { say: ["Two gateways have this name, and their results are mixed."], more: verdicts.flatMap((v) => ["One of them: ", ...v, " "]) };
   if (row.kind === "held") return heldWords(row, verdicts, trends);
-  if (verdicts.length) return { say: verdicts.flatMap((v) => [...v, " "]), more: [often(row.verdicts[0]), " ", ...steady(row), cause(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
+  if (verdicts.length) return { say: verdicts.flatMap((v) => [...v, " "]), more: [often(row.verdicts[0]), " ", ...steady(row), witnessed(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
   if (row.kind === "no data") return { say: ["No data since ", make("b", moment(since)), ": ", ...reason], more: [] };
   if (row.kind === "uncalibrated") return { say: [row.status === "COLLECTING" ? "Windows are being collected: " : "No calibration is in force: ", ...reason], more: [] };
   return soundWords(row, trends);
@@ -148,26 +167,29 @@ const BELOW = " by the command below";
 function advice(reason, waits) {
   const why = explanation(reason), todo = waits ? why?.todo.replace(/ Otherwise: no estimate can be put in force.*$/, "") : why?.todo;
   const told = why?.best && todo.replace(/: fieldcal command accept --sequence \d+$/, BELOW).replace(/([^.])$/, "$1.");
-  if (told?.startsWith("Correct it")) return `Another ${why.best}? ${told}`;
+  if (told?.startsWith("Correct it")) return `Another ${make("span", cause(why.best)).textContent}? ${told}`;
   return told || "Look at the mount. If it is loose, fasten it: windows that fit again end HELD.";
 }
 
-export const ofDoubled = () => [make("p", "Find the copy (its log says it too), stop it, and give it another name, data directory and key:"), copier("sudo systemctl stop fieldcal")];
+const KEYED = "on a machine with your key (KEY: its file; ENDPOINT: the router):";
 
-// What a person can do: elements with a command to copy.
+export const ofDoubled = () => [make("p", "Find the copy (the log of each names its run) and give it another name, data directory and key. Until then, on the copy alone:"), copier("sudo systemctl stop fieldcal")];
+
+// What a person can do: elements with a command to copy, and where to run it.
 export function steps(row, trends) {
-  const gateway = `${row.site}/${row.gateway}`, order = (verb, given) => commandLine({ gateway, sensor: row.sensor, verb, arguments: given }, "--connect ENDPOINT");
+  const gateway = clean(`${row.site}/${row.gateway}`), order = (verb, given) => commandLine({ gateway, sensor: row.sensor, verb, arguments: given }, "--connect ENDPOINT"), here = `on gateway ${gateway}:`;
+  const visit = () => [make("p", `Compare it with another reference, ${here}`), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`)];
   const waits = row.estimate && row.estimate_utc_ns >= (trends?.held_utc_ns ?? row.status_utc_ns) && row.status === "HELD";
-  const told = row.kind === "held" ? advice(row.reason, waits) : "", asked = told.includes(BELOW) ? [] : [make("p", `If the sensor has really changed, accept estimate ${row.estimate}:`)];
-  const accept = waits ? [...asked, copier(order("accept", { sequence: row.estimate }))] : [];
-  if (row.kind === "silent") return [make("p", "Look at power and network, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
-  if (row.kind === "changed") return [make("p", "Find out what happened to it: mount, cable, temperature, reference. Compare it with another reference."), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`)];
-  if (row.kind === "drifting") return [make("p", "Compare it with another reference. If that agrees, accept what it shows."), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`), ...accept];
-  if (row.kind === "held" && ON_HOLD.test(row.reason)) return [make("p", "An operator put it on hold. To use windows again:"), copier(order("hold", { release: true }))];
-  if (row.kind === "held") return [make("p", told), ...(accept.length ? accept : [copier("fieldcal show --data-dir /var/lib/fieldcal")])];
+  const told = row.kind === "held" ? advice(row.reason, waits) : "", asked = told.includes(BELOW) ? `Run it ${KEYED}` : `If the sensor has really changed, accept estimate ${row.estimate}, ${KEYED}`;
+  const accept = waits ? [make("p", asked), copier(order("accept", { sequence: row.estimate }))] : [];
+  if (row.kind === "silent") return [make("p", `Look at power and network, then ${here}`), copier(`fieldcal doctor ${GATEWAY}`)];
+  if (row.kind === "changed") return [make("p", "Find out what happened to it: mount, cable, temperature, reference."), ...visit()];
+  if (row.kind === "drifting") return [...visit(), ...(accept.length ? accept : [make("p", "If that agrees, accept what it shows.")])];
+  if (row.kind === "held" && ON_HOLD.test(row.reason)) return [make("p", `An operator put it on hold. To use windows again, ${KEYED}`), copier(order("hold", { release: true }))];
+  if (row.kind === "held") return [make("p", told), ...(accept.length ? accept : [make("p", `What it knows, ${here}`), copier("fieldcal show --data-dir /var/lib/fieldcal")])];
   if (row.kind === "doubled") return ofDoubled();
-  if (row.kind === "no data") return [make("p", "Check power and cables of the sensor, then on the gateway:"), copier(`fieldcal doctor ${GATEWAY}`)];
-  if (row.kind === "uncalibrated") return [make("p", "Turn the sensor to the position that the log names:"), copier("journalctl -fu fieldcal -o cat")];
+  if (row.kind === "no data") return [make("p", `Check power and cables of the sensor, then ${here}`), copier(`fieldcal doctor ${GATEWAY}`)];
+  if (row.kind === "uncalibrated") return [make("p", `Turn the sensor to the position that the log names, ${here}`), copier("journalctl -fu fieldcal -o cat")];
   return [];
 }
 
