@@ -14,8 +14,8 @@ from pydantic import Field, model_validator
 from hw import epson_frames as epson
 from hw.block import BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
-from hw.frame_stream import DecodedFrames, FrameStream
-from hw.frames import FrameSearch
+from hw.frame_stream import Decoded, FrameStream
+from hw.frames import Found
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
 from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
 from hw.unchecked_frames import UncheckedFrames
@@ -138,17 +138,17 @@ class EpsonStream(FrameStream):
     def _count(self, frames: NDArray[np.uint8]) -> NDArray[np.uint16]:
         return epson.counts(frames, self._output)
 
-    def _find(self, data: bytes) -> FrameSearch:
+    def _find(self, data: bytes) -> Found:
         return super()._find(data) if self._output is epson.ACCELERATION else self._unchecked.find(data)
 
-    def _decode(self, found: FrameSearch) -> DecodedFrames:
+    def _decode(self, found: Found) -> Decoded:
         frames = found.frames
         accelerations = self._output is epson.ACCELERATION
         if accelerations and (wrong := epson.faulty(frames)).any():
             self.failed, frames = True, frames[: int(wrong.argmax())]
         raw_degc = epson.temperature(frames[-1]) if accelerations and len(frames) else (None, None)
         indications = epson.indications(frames, self._output)
-        return DecodedFrames(indications, np.arange(len(frames)), self._breaks(self._count(frames)), *raw_degc)
+        return Decoded(indications, np.arange(len(frames)), self._breaks(self._count(frames)), *raw_degc)
 
     def _breaks(self, counts: NDArray[np.uint16]) -> list[Break]:
         if not len(counts):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hw.block import BlockFlags, Drop, SampleBlock
 from hw.cutting import MOST_BREAKS, Break, Cutter, Stretch
-from hw.frames import FrameSearch, Layout, find
+from hw.frames import Found, Layout, find
 
 NO_FRAME = "no frame"
 NOT_FOLLOWING = (
@@ -21,7 +21,7 @@ NOT_FOLLOWING = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DecodedFrames:
+class Decoded:
     """Samples of a sequence of frames.
 
     `indications` (n, axes); `frame` (n,) is the index of the frame that completed each sample.
@@ -49,10 +49,10 @@ class FrameStream(ABC):
         self.begin()
 
     @abstractmethod
-    def _decode(self, found: FrameSearch) -> DecodedFrames:
+    def _decode(self, found: Found) -> Decoded:
         """Return the samples of these frames."""
 
-    def _find(self, data: bytes) -> FrameSearch:
+    def _find(self, data: bytes) -> Found:
         """Find the frames in `data`, which begins with the rest of the call before."""
         return find(data, self._layout)
 
@@ -108,7 +108,7 @@ class FrameStream(ABC):
             decoded.breaks,
         )
 
-    def _keep(self, found: FrameSearch, read: NDArray[np.int64]) -> None:
+    def _keep(self, found: Found, read: NDArray[np.int64]) -> None:
         """Keep the bytes that are not decided; `read` (B,) are the positions after each burst."""
         first = int(np.searchsorted(read, found.rest_at, side="right"))
         edges = [found.rest_at, *read[first:].tolist()]

@@ -77,7 +77,7 @@ class Layout:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FrameSearch:
+class Found:
     """Result of a search for frames in `data`.
 
     - `start`, `end` (N,): first byte of each frame, and the position after it.
@@ -116,7 +116,7 @@ class FrameSearch:
         return int(self.rest_at - (self.end - self.start).sum())
 
 
-def find(data: bytes, layout: Layout) -> FrameSearch:
+def find(data: bytes, layout: Layout) -> Found:
     """Find all frames in `data` that have a checksum.
 
     If a frame does not fit, the search continues one byte later, because the first bytes of a frame may also occur
@@ -136,7 +136,7 @@ def find(data: bytes, layout: Layout) -> FrameSearch:
             at += 1
     place = np.array(starts, np.int64)
     rest_at = at if at >= 0 else _beginning(data, layout.start, free)
-    return FrameSearch(data, place, place + layout.length, rest_at, layout.length)
+    return Found(data, place, place + layout.length, rest_at, layout.length)
 
 
 def _beginning(data: bytes, start: bytes, free: int) -> int:

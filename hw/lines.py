@@ -42,7 +42,7 @@ _NAMED = re.compile(rb"[^\d\s:=][^\s:=]{0,31}[ \t]?[:=][ \t]{0,8}" + _DECIMAL)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DecodedLines:
+class Decoded:
     """Result of `decode`: `line` (N,) numbers of the good lines, counted from 0; `values` (N, read columns)."""
 
     line: NDArray[np.int64]
@@ -64,7 +64,7 @@ def _pattern(fields: tuple[bytes, ...]) -> re.Pattern[bytes]:
     return re.compile(_BLANKS + b"(?:" + b"|".join(forms) + b")" + _BLANKS)
 
 
-def decode(text: bytes, columns: int, ignored: frozenset[int] = frozenset()) -> DecodedLines:
+def decode(text: bytes, columns: int, ignored: frozenset[int] = frozenset()) -> Decoded:
     """Decode complete lines, each ended by LF, with `columns` fields each; those at `ignored` may hold anything.
 
     Blank lines and comments (#) are skipped. A line is bad if it has another number of fields, a field that is not a
@@ -82,7 +82,7 @@ def decode(text: bytes, columns: int, ignored: frozenset[int] = frozenset()) -> 
     bad = _bad(lines, line.tolist()) if len(line) < len(lines) else {}
     overlong = [len(text) + 1 for text in bad.values() if _overlong(text)]
     faults = Counter(_fault(text) for text in bad.values() if not _overlong(text))
-    return DecodedLines(line, values[sound], list(bad), faults, sum(overlong))
+    return Decoded(line, values[sound], list(bad), faults, sum(overlong))
 
 
 def _bad(lines: Sequence[bytes], good: Sequence[int]) -> dict[int, bytes]:

@@ -22,7 +22,7 @@ Indications = NDArray[np.int32] | NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MessageSamples:
+class Piece:
     """Consecutive samples (n, axes), the time of the last one or of its arrival, and what lies before the first one."""
 
     indications: Indications
@@ -44,7 +44,7 @@ class MessageSensor(PollingSensor):
         super().__init__(name, options, **timing)
         limit = options.full_scale or np.inf
         self._cutter = Cutter(name, options.rate_hz, -limit, limit)
-        self._pieces: list[MessageSamples] = []  # less than a block
+        self._pieces: list[Piece] = []  # less than a block
         self._waiting = 0  # samples in them
         self._last_ns = 0  # time of the newest sample, CLOCK_MONOTONIC
         self._utc_ns = 0  # UTC less CLOCK_MONOTONIC
@@ -54,7 +54,7 @@ class MessageSensor(PollingSensor):
         """Connect. Raises DeviceLost or ConfigurationError."""
 
     @abstractmethod
-    def _receive(self) -> Iterator[MessageSamples]:
+    def _receive(self) -> Iterator[Piece]:
         """The samples of all messages that have come; waits for none. Raises DeviceLost."""
 
     def _start(self) -> DeviceInfo:
@@ -84,7 +84,7 @@ class MessageSensor(PollingSensor):
         moved, self._utc_ns = utc_ns - now_ns - self._utc_ns, utc_ns - now_ns
         return abs(moved) > 0.5e9 / float(self._options.rate_hz)
 
-    def _follows(self, piece: MessageSamples) -> bool:
+    def _follows(self, piece: Piece) -> bool:
         """Whether time goes on; if not, the piece is counted as lost and the next block carries RESTART."""
         if piece.t_monotonic_ns >= self._last_ns:
             self._last_ns = piece.t_monotonic_ns

@@ -14,8 +14,8 @@ from pydantic import Field, model_validator
 from hw import mip_packets as mip
 from hw.block import LARGEST, BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
-from hw.frame_stream import DecodedFrames, FrameStream
-from hw.frames import FrameSearch, Layout
+from hw.frame_stream import Decoded, FrameStream
+from hw.frames import Found, Layout
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
 from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, LOST, AskedSensor, SerialOptions
 from hw.units import STANDARD_GRAVITY_MPS2, asked_of_certificate, nominal_sensitivity
@@ -79,10 +79,10 @@ class MipStream(FrameStream):
         self._last_s: float | None = None
         self.restarted = False
 
-    def _find(self, data: bytes) -> FrameSearch:
+    def _find(self, data: bytes) -> Found:
         return mip.find(data)
 
-    def _decode(self, found: FrameSearch) -> DecodedFrames:
+    def _decode(self, found: Found) -> Decoded:
         rows, times_s, which = mip.samples(mip.packets(found), self.clock)
         sound = (np.abs(rows) <= LARGEST).all(axis=1) & np.isfinite(times_s)
         rows, times_s, which = rows[sound], times_s[sound], which[sound]
@@ -92,7 +92,7 @@ class MipStream(FrameStream):
         elif breaks and breaks[-1].flags & BlockFlags.RESTART:
             self.restarted = True
             rows, which, breaks = rows[: breaks[-1].at], which[: breaks[-1].at], breaks[:-1]
-        return DecodedFrames(rows, which, breaks)
+        return Decoded(rows, which, breaks)
 
     def _breaks(self, times_s: np.ndarray) -> list[Break]:
         """Breaks up to the first RESTART."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hw.frames import CHECKSUMS, FrameSearch
+from hw.frames import CHECKSUMS, Found
 
 SYNC = b"\x75\x65"
 HEADER, CHECKSUM, LEAST_FIELD = 4, 2, 2  # bytes
@@ -84,7 +84,7 @@ def fields(whole: bytes) -> Iterator[tuple[int, bytes]]:
         at += whole[at]
 
 
-def find(data: bytes) -> FrameSearch:
+def find(data: bytes) -> Found:
     """Find all packets in `data`: with the right checksum, and filled by their fields."""
     starts: list[int] = []
     ends: list[int] = []
@@ -100,7 +100,7 @@ def find(data: bytes) -> FrameSearch:
         else:
             at += 1
     rest_at = at if at >= 0 else len(data) - data[free:].endswith(SYNC[:1])
-    return FrameSearch(data, np.array(starts, np.int64), np.array(ends, np.int64), rest_at)
+    return Found(data, np.array(starts, np.int64), np.array(ends, np.int64), rest_at)
 
 
 def _checksum(body: bytes) -> bytes:
@@ -114,7 +114,7 @@ def _is_filled(whole: bytes) -> bool:
     return at == end
 
 
-def packets(found: FrameSearch) -> list[bytes]:
+def packets(found: Found) -> list[bytes]:
     """The packets that were found."""
     return [found.data[begin:end] for begin, end in zip(found.start.tolist(), found.end.tolist(), strict=True)]
 

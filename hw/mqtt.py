@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from hw.block import BlockFlags, DeviceInfo
-from hw.message_sensor import OUTSIDE, MessageSamples, MessageSensor
+from hw.message_sensor import OUTSIDE, MessageSensor, Piece
 from hw.mqtt_payload import Block, Json, PayloadError, Sparkplug
 from hw.sensor import ConfigurationError, DeviceLost, Options
 from hw.units import Unit, asked_of_certificate, nominal_sensitivity, tells_sensitivity
@@ -189,7 +189,7 @@ class Mqtt(MessageSensor):
         except Exception as error:  # the library raises anything on bytes that are no MQTT
             raise DeviceLost(f"{self._where()}: the broker sent what is no MQTT: {error!r}") from error
 
-    def _receive(self) -> Iterator[MessageSamples]:
+    def _receive(self) -> Iterator[Piece]:
         if self._follow_utc() and self._options.stamp != "arrival":
             self._before = BlockFlags.RESTART
         self._exchange()
@@ -220,7 +220,7 @@ class Mqtt(MessageSensor):
         except PayloadError:
             raise PayloadError(UNREADABLE) from None
 
-    def _piece(self, block: Block, now_ns: int, utc_ns: int) -> MessageSamples:
+    def _piece(self, block: Block, now_ns: int, utc_ns: int) -> Piece:
         """The samples with their time and with what lies before them. Raises PayloadError."""
         n, o = len(block.indications), self._options
         if n > LONGEST_S * o.rate_hz:
@@ -235,7 +235,7 @@ class Mqtt(MessageSensor):
             raise PayloadError(OUTSIDE)
         flags, missing = self._break_before(block.counter)
         self._next = None if block.counter is None else block.counter + n
-        return MessageSamples(block.indications, now_ns, utc_ns, flags, missing)
+        return Piece(block.indications, now_ns, utc_ns, flags, missing)
 
     def _break_before(self, counter: int | None) -> tuple[BlockFlags, int]:
         """What lies before the samples of a message whose first one has this number. Raises PayloadError."""

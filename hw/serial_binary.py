@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 
 from hw.block import LARGEST, BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
-from hw.frame_stream import DecodedFrames, FrameStream
-from hw.frames import WIDTH, ByteOrder, ChecksumName, FrameSearch, Layout, NumberType, numbers
+from hw.frame_stream import Decoded, FrameStream
+from hw.frames import WIDTH, ByteOrder, ChecksumName, Found, Layout, NumberType, numbers
 from hw.sensor import DeviceLost
 from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, Filters, SerialOptions, SerialSensor
 from hw.unchecked_frames import UncheckedFrames
@@ -168,7 +168,7 @@ class BinaryStream(FrameStream):
             f"in {search.undecided} frames one after the other; state checksum, end or sequence"
         )
 
-    def _find(self, data: bytes) -> FrameSearch:
+    def _find(self, data: bytes) -> Found:
         return self._unchecked.find(data) if self._layout.checksum == "none" else super()._find(data)
 
     def _sequence(self, frames: NDArray[np.uint8]) -> NDArray[np.unsignedinteger]:
@@ -176,7 +176,7 @@ class BinaryStream(FrameStream):
         assert kind is not None
         return cast(NDArray[np.unsignedinteger], numbers(frames, kind.at, kind.type, self._options.byte_order))
 
-    def _decode(self, found: FrameSearch) -> DecodedFrames:
+    def _decode(self, found: Found) -> Decoded:
         options = self._options
         columns = [numbers(found.frames, n.at, n.type, options.byte_order) for n in options.indications]
         counted = all(n.type not in ("f32", "u32") for n in options.indications)
@@ -184,14 +184,14 @@ class BinaryStream(FrameStream):
             values = np.column_stack(columns).astype(np.int32 if counted else np.float64)
         sound = (np.abs(values) <= LARGEST).all(axis=1)
         samples = found.frames[sound]
-        return DecodedFrames(
+        return Decoded(
             np.ascontiguousarray(values[sound]),
             np.flatnonzero(sound),
             self._unseen(found, sound) if options.sequence is None else self._follow(samples, options.sequence),
             *self._temperature(samples),
         )
 
-    def _unseen(self, found: FrameSearch, sound: NDArray[np.bool_]) -> list[Break]:
+    def _unseen(self, found: Found, sound: NDArray[np.bool_]) -> list[Break]:
         """Breaks where there are bytes or frames between two samples that are not samples."""
         broken = found.slipped[:-1].copy()
         broken[1:] |= ~sound[:-1]

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from hw.alignment import Alignment, Samples
 from hw.block import BlockFlags
-from hw.message_sensor import OUTSIDE, MessageSamples, MessageSensor
+from hw.message_sensor import OUTSIDE, MessageSensor, Piece
 
 STEP_S = 0.1  # a message of several seconds becomes bursts of this length, whose times follow from its start time
 ALONE = "samples that one axis had and another had not"
@@ -42,7 +42,7 @@ class StampedSensor(MessageSensor):
         else:
             self._dropped["samples", OUTSIDE] += len(samples)
 
-    def _receive(self) -> Iterator[MessageSamples]:
+    def _receive(self) -> Iterator[Piece]:
         if self._follow_utc():
             self._alignment.restart()
         self._take_messages()
@@ -53,7 +53,7 @@ class StampedSensor(MessageSensor):
                 part = together.indications[begin : begin + step]
                 last = (begin + len(part) - 1) / self._options.rate_hz
                 t_utc_ns = together.start_ns + round(last * 1e9)
-                yield MessageSamples(part, t_utc_ns - self._utc_ns, t_utc_ns, flags, missing)
+                yield Piece(part, t_utc_ns - self._utc_ns, t_utc_ns, flags, missing)
                 flags, missing = BlockFlags.NONE, 0
         self._dropped["samples", ALONE] += self._alignment.alone
         self._dropped["samples", self.repeated] += self._alignment.repeated

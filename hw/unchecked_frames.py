@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from hw.frames import FrameSearch, Layout
+from hw.frames import Found, Layout
 
 AGREEMENT_BITS = 64  # of start and end bytes in neighbouring frames, before their place is believed
 
@@ -42,7 +42,7 @@ class UncheckedFrames:
         self._jumped = False  # whether the newest frame did not count on
         self.places = self.undecided = 0
 
-    def find(self, data: bytes) -> FrameSearch:
+    def find(self, data: bytes) -> Found:
         """Find the frames in `data`: the rest of the piece before, and new bytes."""
         length, end = self._layout.length, self._layout.end
         begins = _matches(data, self._layout.start)
@@ -75,7 +75,7 @@ class UncheckedFrames:
             if self._in_step:
                 break
         found = np.concatenate(starts)
-        return FrameSearch(data, found, found + length, at, length)
+        return Found(data, found, found + length, at, length)
 
     def _place(
         self, counts: NDArray[np.unsignedinteger] | None, fits: NDArray[np.bool_], at: int

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from hw import witmotion_frames as wit
 from hw.block import BlockFlags, DeviceInfo
 from hw.cutting import Break, Cutter, follow
-from hw.frame_stream import DecodedFrames, FrameStream
-from hw.frames import FrameSearch, find
+from hw.frame_stream import Decoded, FrameStream
+from hw.frames import Found, find
 from hw.sensor import ConfigurationError, DeviceLost, IdentityError
 from hw.serial_sensor import BITS_A_BYTE, LONGEST_GAP_S, SerialOptions, SerialSensor
 
@@ -65,7 +65,7 @@ class WitStream(FrameStream):
         self._last_ms: int | None = None
         self.restarted = False
 
-    def _decode(self, found: FrameSearch) -> DecodedFrames:
+    def _decode(self, found: Found) -> Decoded:
         waiting = 0 if self._time_frame is None else 1
         frames = found.frames if self._time_frame is None else np.vstack([self._time_frame, found.frames])
         kind = frames[:, 1]
@@ -81,7 +81,7 @@ class WitStream(FrameStream):
             frame, breaks = frame[: breaks[-1].at], breaks[:-1]
         samples = frames[frame]
         raw_degc = wit.temperature(samples[-1]) if len(samples) else (None, None)
-        return DecodedFrames(wit.counts(samples), frame - waiting, breaks, *raw_degc)
+        return Decoded(wit.counts(samples), frame - waiting, breaks, *raw_degc)
 
     def _breaks(self, times_ms: np.ndarray) -> list[Break]:
         if not len(times_ms):

@@ -13,7 +13,7 @@ import numpy as np
 import serial
 
 from hw.line_columns import AXES, IGNORED, Column, kind_of
-from hw.lines import MOST_COLUMNS, DecodedLines, decode, with_newlines
+from hw.lines import MOST_COLUMNS, Decoded, decode, with_newlines
 from hw.serial_sensor import LOST, READ_BYTES, reason_of
 
 FIRST_LINE_S = 5.0  # opening the port restarts some boards, which need two seconds
@@ -143,7 +143,7 @@ def _columns(kinds: Sequence[Column | None]) -> tuple[Column, ...] | None:
     return tuple(columns)
 
 
-def _why(decoded: DecodedLines, lines: Sequence[bytes], count: int) -> str:
+def _why(decoded: Decoded, lines: Sequence[bytes], count: int) -> str:
     """What is wrong with the last line that cannot be read; "" without one."""
     if not decoded.bad_at:
         return ""

@@ -15,7 +15,7 @@ WAITING = """
 import sys, threading, time, types
 import zenoh
 from agent.delivery.session import session_config
-from agent.delivery.ending import Ending
+from agent.delivery.ending import ProcessEnd
 {ending}
 session = zenoh.open(session_config("peer"))
 subscriber = session.declare_subscriber("key", zenoh.handlers.FifoChannel(4))
@@ -31,8 +31,8 @@ print("done")
 # Ends in the way that is given, with the tools of an exit: a handler, a thread that is waited for, buffered output.
 ENDS = """
 import atexit, sys, threading, time
-from agent.delivery.ending import Ending
-ending = Ending()
+from agent.delivery.ending import ProcessEnd
+ending = ProcessEnd()
 atexit.register(print, "handler")
 def last():
     time.sleep(0.2)
@@ -50,7 +50,7 @@ def ended(code: str, **streams: int) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_thread_that_waits_in_zenoh_does_not_abort_the_process() -> None:
-    with_ending = ended(WAITING.replace("{ending}", "Ending().status = 0"))
+    with_ending = ended(WAITING.replace("{ending}", "ProcessEnd().status = 0"))
     assert (with_ending.returncode, with_ending.stdout, with_ending.stderr) == (0, "done\n", "")
 
 
