@@ -41,12 +41,12 @@ class LagDrift:
 
 
 def drift(windows: Sequence[Window]) -> LagDrift | None:
-    """The straight line through the lags of all segments of the used windows of kind "motion".
+    """The straight line through the lags of all segments of the used windows of kind "motion" that tell a lag.
 
     None if there are fewer than LEAST_SEGMENTS.
     """
     moving = [w for w in windows if w.used and w.kind == "motion"]
-    told = [(w, u_s) for w in moving if np.isfinite(u_s := u_lag_s(w))]
+    told = [(w, u_s) for w in moving if np.isfinite(u_s := u_common_lag_s(w))]
     found = [(lags, u_s) for w, u_s in told if len(lags := segment_lags(w))]
     if sum(len(lags) for lags, _ in found) < LEAST_SEGMENTS:
         return None
@@ -66,7 +66,7 @@ def drift(windows: Sequence[Window]) -> LagDrift | None:
     return LagDrift(middle, float(line[0]), float(line[1]), float(np.sqrt(inverse[1, 1] * max(scatter, 1.0))))
 
 
-def u_lag_s(window: Window) -> float:
+def u_common_lag_s(window: Window) -> float:
     """The standard uncertainty in s of the lag that all segments of a window share: what u tells of du/dt, the window's
     sensitivities may tell of V in the place of a lag. inf where noise alone is left of du/dt.
     """

@@ -57,9 +57,10 @@ class Segments:
 class TypeA:
     """How much slopes and means scatter.
 
-    `noise` (W, 3): SD of the residuals within each window, output unit. `slopes` (6M, 6M) in the order basis, axis and
-    `means` (3, 3): covariance of the whitened slopes and means, identities if the residuals were what a filter makes of
-    white noise, independent between axes. `degrees_of_freedom` of both, inf where single segments allow no estimate.
+    `noise` (W, 3): SD of the residuals within each window, and of what silent channels add, output unit. `slopes`
+    (6M, 6M) in the order basis, axis and `means` (3, 3): covariance of the whitened slopes and means, identities if the
+    residuals were what a filter makes of white noise, independent between axes. `degrees_of_freedom` of both, inf where
+    single segments allow no estimate.
     `known`: how far segments tell it, 1 where they are enough; else the rest is what a filter makes of white noise.
     `scores` (2, LEVELS, SUMS): the sums of both from which this follows.
     """
@@ -91,12 +92,14 @@ def pooled(
     `alike`: all windows are taken to be as noisy as their mean, so that all points weigh the same (Method 3).
     """
     slopes = [np.swapaxes(t, 1, 2) @ (t @ part.xv.sum(1)) for t, part in zip(whiteners, parts, strict=True)]
-    noise = in_order(parts, [_noise(*each) for each in zip(parts, slopes, roots, strict=True)])
+    left, shared = (in_order(parts, own) for own in zip(*map(_noise, parts, slopes, roots), strict=True))
+    noise = np.hypot(left, shared)
     # Scores are summed in one unit. Each in units of its own window's noise would seem too small: it made that noise.
+    # They are sums of residuals, which have no noise of silent channels.
     count = in_order(parts, [part.count.sum(1) for part in parts])
-    sd = np.sqrt(count @ noise**2 / count.sum())
+    sd = np.sqrt(count @ left**2 / count.sum())
     if alike:
-        noise = np.tile(sd, (len(noise), 1))
+        noise = np.tile(np.sqrt(count @ noise**2 / count.sum()), (len(noise), 1))
     slope_scores, mean_scores = list[Scores](), list[Scores]()
     for part, beta, t, root in zip(parts, slopes, whiteners, roots, strict=True):
         unit = (sd / np.sqrt(part.independent)[:, None])[:, None]
@@ -112,20 +115,23 @@ def pooled(
     return TypeA(noise, slope_cov, mean_cov, freedom, known, np.array([sums, mean_sums]))
 
 
-def _noise(part: Segments, slopes: Array, root: Array) -> Array:
-    """(W, 3) SD of the residuals of the windows with these slopes."""
+def _noise(part: Segments, slopes: Array, root: Array) -> tuple[Array, Array]:
+    """(W, 3) SD of the residuals of the windows with these slopes, and (W, 3) what silent channels add to it: to their
+    noise the motion is known that they share."""
     count, xv, vv = part.count.sum(1), part.xv.sum(1), np.diagonal(part.vv.sum(1), axis1=1, axis2=2)
-    moved = part.xx.sum(1)
-    xx = moved + count[:, None, None] * part.noise[:, None] * np.eye(part.noise.shape[1])
+    moved, m = part.xx.sum(1), part.noise.shape[1] // 2
+    xx = moved + count[:, None, None] * part.noise[:, None] * np.eye(2 * m)
     left = vv - 2.0 * np.einsum("wci,wci->wi", slopes, xv) + np.einsum("wci,wcd,wdi->wi", slopes, xx, slopes)
-    signal, m = vv + count[:, None] * part.mean[:, -3:] ** 2, part.noise.shape[1] // 2
+    signal = vv + count[:, None] * part.mean[:, -3:] ** 2
     freedom = count - 1.0 - np.count_nonzero(np.diagonal(root, axis1=1, axis2=2), axis=1)
     floor = NOISE_FLOOR * np.sqrt(signal.max(axis=1) / count)
     spread = np.sqrt(np.maximum(left, 0.0) / np.maximum(freedom, 1.0)[:, None])
     felt, power = (np.einsum("wkk->w", own) for own in (np.swapaxes(slopes, 1, 2) @ moved @ slopes, moved[:, :m, :m]))
     sensitivity2 = np.divide(felt, power, out=np.zeros_like(power), where=power > 0.0)
-    spread = np.hypot(spread, np.sqrt(sensitivity2[:, None] * part.silent))
-    return np.asarray(np.maximum(spread, np.where(floor > 0.0, floor, 1.0)[:, None]))
+    return (
+        np.maximum(spread, np.where(floor > 0.0, floor, 1.0)[:, None]),
+        np.sqrt(sensitivity2[:, None] * part.silent),
+    )
 
 
 def _with_data(score: Array, live: NDArray[np.bool_]) -> list[Scores]:
