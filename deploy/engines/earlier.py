@@ -71,6 +71,8 @@ REVISIONS = (
     Revision(15, "d84dd71c851d", "0.2.0"),
     # The last before noise and rounding of a tri-axial reference beside one tone were taken for motion.
     Revision(16, "bda75986f69f", "0.3.0"),
+    # The last before U contains what channels without a signal of their own add to transverse slopes.
+    Revision(17, "1cf1dd153582", "0.3.0"),
 )
 
 
