@@ -407,7 +407,7 @@ class Estimation:
             u_S = (size - 1.0) * self.state.result().sensitivity.ravel()
             for place in range(len(self._beside)):
                 self.use(place)
-                self.state.step(self.state.changes(np.append(u_S, np.zeros(3)), line=True, another_filter=True))
+                self.state.step(self.state.changes(np.append(u_S, np.zeros(3)), line=True, another_filter=np.inf))
                 u_S = np.zeros(9)
             self.use(0)
             self._held = []
@@ -447,8 +447,8 @@ class Estimation:
         change of S looks like, "" where nothing is followed or nothing can be said.
 
         A drift has made S or Q wrong since its onset. U covers this, and the rate becomes unknown. What looks like a
-        change of S may be another filter, so that the response over frequency is found anew with S, or one of the
-        reference, which may then have changed by as much.
+        change of S may be another filter, so that the response over frequency may have changed by as much at the
+        frequency of S, or one of the reference, which may then have changed by as much.
         """
         loose, rate = np.zeros(12), np.zeros(12)
         for k, verdict in enumerate(self.drift.result()):
@@ -462,8 +462,8 @@ class Estimation:
             since_s = min(own.onset_s for own, size in zip(self.drift.result(), loose[:9], strict=False) if size)
             shape = self._shape(since_s / DAY_S, newest)
         if loose.any():
-            leaning_rad, another_filter = tilt_rad(loose[9:], self.state.scale), bool(loose[:9].any())
-            u = self.state.changes(loose, leaning_rad, u_rate=rate, another_filter=another_filter)
+            leaning_rad, of_S = tilt_rad(loose[9:], self.state.scale), float(loose[:9].max()) / self.state.scale
+            u = self.state.changes(loose, leaning_rad, u_rate=rate, another_filter=of_S)
             self.state.step(u | self._of_reference(loose))
             self.drift.restart(loose > 0.0)
         return shape

@@ -149,7 +149,7 @@ def _shapes(moved: Array, white: Array, S: Array, directions: Array) -> Iterator
 
 def _of_sensor(state: State, held: Sequence[Record], leaning_rad: float = 0.0, wider: float = 1.0) -> dict[str, float]:
     """A line that was plugged anew may be late by another time; that is no change of S or Q."""
-    return state.changes(wider * possible_jump(state, held), leaning_rad, line=True, another_filter=True)
+    return state.changes(wider * possible_jump(state, held), leaning_rad, line=True, another_filter=np.inf)
 
 
 def _tried(state: State, held: Sequence[Record], u: Mapping[str, float], limit: Limit, before: float) -> TriedStep:

@@ -228,9 +228,18 @@ class OverFrequency:
 
     def log_h(self, state: Now, reference: str, frequency_hz: float) -> float:
         """ln |h| beside a reference at a frequency, 0 at 0 Hz."""
+        own, effects = self._effects(state, reference, frequency_hz)
+        return float(effects @ state.mean[own])
+
+    def prior_of(self, state: Now, reference: str, frequency_hz: float, u_terms: float) -> float:
+        """Standard uncertainty of ln |h| beside a reference at a frequency, if each term had this one."""
+        return u_terms * float(np.linalg.norm(self._effects(state, reference, frequency_hz)[1]))
+
+    def _effects(self, state: Now, reference: str, frequency_hz: float) -> tuple[list[int], Array]:
+        """Where the terms of the response beside a reference are in a state, and their effects on ln |h|."""
         own, unit = self._unknowns(state, reference)
         moved = by_term(np.array(2.0 * np.pi * frequency_hz)).real * unit
-        return float(moved[: len(own)] @ state.mean[own])
+        return own, np.asarray(moved[: len(own)])
 
     def _unknowns(self, state: Now, reference: str) -> tuple[list[int], Array]:
         """Where the first terms of the response beside a reference are in a state, and the units (5,) of all terms."""

@@ -491,13 +491,14 @@ class State:
         *,
         u_rate: Array = STEADY,
         line: bool = False,
-        another_filter: bool = False,
+        another_filter: float = 0.0,
     ) -> dict[str, float]:
         """Standard uncertainties of a step, by key: of S and Q (12,), or of all `quantities` (N,), and of the tilt of a
         fixed mount.
 
         `u_rate` (12,): S and Q may drift by as much more a day. `line`: a device or its line may have begun anew, which
-        makes the lag another. `another_filter`: the response over frequency may be another.
+        makes the lag another. `another_filter`: the response over frequency may be another, so that S, which holds at
+        one frequency, changes by about this share of itself; inf if nobody knows by how much.
         """
         u = {q.key: abs(float(s)) for q, s in zip(self.quantities, standard_uncertainty, strict=False) if s}
         u |= {ALL_RATES[p]: abs(float(u_rate[p])) for p in np.flatnonzero(u_rate).tolist()}
@@ -506,10 +507,12 @@ class State:
             of_it = () if quantity.centre else quantity.kind.loosened_by
             if "lean" in of_it and self._fixed and tilt_rad:
                 u[quantity.key] = tilt_rad
-            elif quantity.owner == self.reference and (
-                (line and "line" in of_it) or (another_filter and "filter" in of_it)
-            ):
+            elif quantity.owner == self.reference and line and "line" in of_it:
                 u[quantity.key] = stated.of(quantity.kind.prior)
+            elif quantity.owner == self.reference and another_filter and "filter" in of_it:
+                prior = stated.of(quantity.kind.prior)
+                of_S = self._over.prior_of(self._now, self.reference, self.reference_frequency_hz, prior)
+                u[quantity.key] = prior * min(1.0, another_filter / of_S) if of_S else prior
         return u
 
     def after(self, records: Sequence[Record], u: Jump) -> Self:

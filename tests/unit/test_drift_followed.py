@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from agent.core.snapshot import pack, unpack
+from benchmarks.online.lorries import after, window
 from calib.estimate.nuisances import Priors
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.state.state import State
 from calib.windows.record import Record
 from tests.building_windows import building_window
-from tests.clamp_windows import Q_TRUE, S_TRUE
+from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE
 
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
@@ -73,3 +74,15 @@ def test_a_state_with_a_rate_of_s_goes_on_from_its_snapshot() -> None:
     for state in (found, again):
         state.update(window)
     assert pack(again.snapshot()) == pack(found.snapshot())
+
+
+@pytest.mark.parametrize(("share", "added_mps2"), [(0.0, 0.0), (0.005, 0.005 * G_MPS2), (np.inf, 1.47)])
+def test_a_small_change_of_s_is_no_filter_that_takes_half_of_it(share: float, added_mps2: float) -> None:
+    """S at 0 Hz times gravity is in Q of a mount that stays: U of Q grows by the change of S, not by 1.5 m/s2."""
+    found = after([window(seed) for seed in range(4)])
+    before = found.result().standard_uncertainty
+    found.step(found.changes(np.zeros(12), another_filter=share))
+    u = found.result().standard_uncertainty
+    np.testing.assert_allclose(u[:9], before[:9], rtol=1e-6)  # S holds at its frequency, with any filter
+    added = np.sqrt(max(u[11] ** 2 - before[11] ** 2, 0.0)) / found.scale
+    assert added == pytest.approx(added_mps2, rel=0.03, abs=1e-6)
