@@ -19,6 +19,8 @@ PHASE_LEFT = 1e-8
 AS_HIGH = 0.9  # of the highest peak of a correlation: peaks of motion with one frequency differ by less
 FINER = 4  # lags a sample: the fastest motion that resampling keeps turns by half a rad from one to the next
 SEGMENT_S = 2.0  # of samples that have one lag: a few cycles of the motion
+PIECE_S = 20.0  # of samples that are correlated at once: clocks that differ by 200 ppm change their lag by 4 ms
+MOST_PIECES, MOST_RATES = 200, 500  # of a recording, that of a day too
 IntArray = NDArray[np.int64]
 Made = TypeVar("Made")
 
@@ -125,25 +127,64 @@ def largest_omega(windows: Sequence[Window]) -> float:
     return largest
 
 
-def correlated_lag_s(parts: Iterable[tuple[Array, Array]], rate_hz: float, furthest_s: float) -> float | None:
-    """The lag in s at which the outputs V follow the reference u best, from their cross-correlation.
+def correlated_lag(
+    parts: Iterable[tuple[Array, Array, Array]], furthest_s: float, most_rate: float, omega: float
+) -> tuple[float, float, float] | None:
+    """The lag in s at which the outputs V follow the reference u best, by their cross-correlation; by how much it
+    changes in a second, where the two clocks run apart; and the time in s at which it is this lag.
 
-    `parts` are stretches of evenly spaced samples: V (n, 3) and u (n, m). Lags up to `furthest_s` to both sides are
-    compared. Where several peaks are almost equally high, as in motion of one frequency, the one nearest to 0 counts.
-    None if there is no motion. The lag is right to about a sample; `without_lag` leads from there to the lag.
+    `parts` are stretches of evenly spaced samples: times (n,) in s, V (n, 3) and u (n, m). Lags up to `furthest_s` to
+    both sides and changes up to `most_rate` are compared; `omega` is the angular frequency of the motion in rad/s. Where
+    several peaks are almost equally high, as in motion of one frequency, that of the slowest change, and of these the
+    one nearest to 0 counts. None if there is no motion. The lag is right to a sample, or to an eighth of a period at
+    both ends of the parts; `without_lag` leads from there to the lag.
     """
-    size = int(np.ceil(furthest_s * rate_hz))
-    correlation = np.zeros(2 * size + 1)
-    for V, u in parts:
-        length = 1 << (len(V) + size).bit_length()
-        out, moved = (np.fft.rfft(x - x.mean(axis=0), length, axis=0) for x in (V, u))
-        power = np.outer(*(np.var(x, axis=0) * len(x) for x in (V, u)))
-        both = np.fft.irfft(out[:, :, None] * moved[:, None, :].conj(), length, axis=0)
-        both = np.concatenate([both[length - size :], both[: size + 1]])
-        correlation += np.sum(np.divide(both**2, power, out=np.zeros_like(both), where=power > 0.0), axis=(1, 2))
-    around = np.concatenate([[-np.inf], correlation, [-np.inf]])
-    peaks = np.flatnonzero((correlation >= around[:-2]) & (correlation >= around[2:]))
-    high = peaks[correlation[peaks] >= AS_HIGH * correlation.max()]
-    if not correlation.max() > 0.0:
+    cut = [piece for part in parts for piece in _pieces(*part)]
+    cut = cut[:: -(-len(cut) // MOST_PIECES)] if cut else []
+    if not cut:
         return None
-    return float((high[np.argmin(np.abs(high - size))] - size) / rate_hz)
+    period_s = float(median(np.diff(cut[0][0])))
+    middles_s = np.array([0.5 * (time_s[0] + time_s[-1]) for time_s, *_ in cut])
+    at_s, half_s = 0.5 * float(middles_s[0] + middles_s[-1]), 0.5 * float(np.ptp(middles_s))
+    finest = max(2.0 * period_s, np.pi / 4.0 / omega) / half_s if half_s else np.inf
+    number = int(min(np.ceil(most_rate / finest), MOST_RATES))
+    rates = np.linspace(-most_rate, most_rate, 2 * number + 1) if number else np.zeros(1)
+    shifts = np.rint(np.outer(rates, middles_s - at_s) / period_s).astype(int)
+    size, more = int(np.ceil(furthest_s / period_s)), int(np.abs(shifts).max())
+    total = np.zeros((len(rates), 2 * size + 1))
+    for (_, V, u), own in zip(cut, shifts.T, strict=True):
+        correlation = _correlation(V, u, size + more)
+        for row, shift in zip(total, own.tolist(), strict=True):
+            row += correlation[more + shift : more + shift + 2 * size + 1]
+    return _slowest_peak(total, rates, period_s, at_s)
+
+
+def _pieces(time_s: Array, V: Array, u: Array) -> Iterable[tuple[Array, Array, Array]]:
+    """Pieces of PIECE_S of a stretch: clocks that run apart change the lag within longer ones."""
+    number = max(1, round(float(time_s[-1] - time_s[0]) / PIECE_S))
+    return zip(*(np.array_split(x, number) for x in (time_s, V, u)), strict=True)
+
+
+def _correlation(V: Array, u: Array, size: int) -> Array:
+    """The squared correlation (2 size + 1,) of outputs and reference, at lags of -size to size samples."""
+    length = 1 << (len(V) + size).bit_length()
+    out, moved = (np.fft.rfft(x - x.mean(axis=0), length, axis=0) for x in (V, u))
+    power = np.outer(*(np.var(x, axis=0) * len(x) for x in (V, u)))
+    both = np.fft.irfft(out[:, :, None] * moved[:, None, :].conj(), length, axis=0)
+    both = np.concatenate([both[length - size :], both[: size + 1]])
+    return np.asarray(np.divide(both**2, power, out=np.zeros_like(both), where=power > 0.0).sum(axis=(1, 2)) * len(V))
+
+
+def _slowest_peak(total: Array, rates: Array, period_s: float, at_s: float) -> tuple[float, float, float] | None:
+    """The peak of correlations (R, 2 size + 1), at these rates and at lags around 0, that counts."""
+    if not total.max() > 0.0:
+        return None
+    around = np.pad(total, 1, constant_values=-np.inf)
+    along = np.maximum(around[1:-1, :-2], around[1:-1, 2:])
+    across = np.maximum(around[:-2], around[2:])
+    across = np.maximum(np.maximum(across[:, :-2], across[:, 2:]), across[:, 1:-1])
+    across[len(rates) // 2] = -np.inf  # clocks that do not run apart are always looked at
+    peaks = np.argwhere((total >= AS_HIGH * total.max()) & (total >= along) & (total >= across))
+    lags = peaks[:, 1] - total.shape[1] // 2
+    first = np.lexsort([np.abs(lags), np.abs(rates[peaks[:, 0]])])[0]
+    return float(lags[first] * period_s), float(rates[peaks[first, 0]]), at_s

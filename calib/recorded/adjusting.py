@@ -15,7 +15,7 @@ from calib.adjustment.verdict import MOST_BETWEEN_BANDS, response_reasons
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import RESPONSE
 from calib.estimate.response_told import LEFT_U, ResponseTold
-from calib.excitation.lag_search import correlated_lag_s, largest_omega, without_lag
+from calib.excitation.lag_search import largest_omega, without_lag
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array, Window
@@ -210,11 +210,12 @@ class _Search:
     def begin(self) -> Applied:
         """Make the first windows; returns what the search goes on with.
 
-        If none can be used the sensor may be far too late, or a response may look like a mean that changes.
+        If none can be used the sensor may be far too late, or a response may look like a mean that changes. If the lags
+        that they show are still large, the two clocks run apart.
         """
         flat = Applied(self._priors.lag_at_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
         applied = self.make(flat)
-        if not _used(self.windows):
+        if not _used(self.windows) or self._tables.far:
             applied = self.make(replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, self.windows)))
         if _used(self.windows):
             return applied
@@ -277,13 +278,13 @@ def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
 
 
 def _likely_lag_s(tables: Tables, priors: Priors, windows: Sequence[Window]) -> float:
-    """Where the search for the lag begins if no window can be used: a sensor that is late seems not to follow its
+    """Where the search for the lag begins if windows do not lead to it: a sensor that is late seems not to follow its
     reference. Steep filters with their corner above the motion delay by up to LAG_PERIODS periods of it."""
     omega = largest_omega(windows)
     if not (priors.lag_s and omega):
-        return 0.0
+        return priors.lag_at_s
     furthest_s = max(LAG_SD * priors.lag_s, LAG_PERIODS * 2.0 * np.pi / omega)
-    return correlated_lag_s(tables.stretches(), tables.rate_hz, furthest_s) or 0.0
+    return tables.likely_lag_s(furthest_s, omega)
 
 
 def with_response(priors: Priors, windows: Sequence[Window]) -> Priors:

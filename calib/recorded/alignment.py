@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.model import Array, Window, WindowSums
+from calib.excitation.lag_search import largest_omega
+from calib.model import Array, Window, WindowSums, own_channels
 from calib.windows.excited import NOISE_LEFT
 from calib.windows.sums import NOISE_FLOOR, factor, pool
 
@@ -27,12 +28,17 @@ LEAST_RATE = 1e-6  # clocks fitted to stamps of one gateway differ by 0.2 ppm, t
 
 @dataclass(frozen=True, slots=True)
 class LagDrift:
-    """Lag over time: `lag_s` at `time_s`; it changes by `rate` (s/s), whose standard uncertainty is `u_rate`."""
+    """Lag over time: `lag_s` at `time_s`; it changes by `rate` (s/s), whose standard uncertainty is `u_rate`.
+
+    `phase_rad`: the largest phase of the motion that a lag on this line is, or, if that is larger, the scatter of the
+    lags about it beyond their noise. What is told of the lag is of first order in it.
+    """
 
     time_s: float
     lag_s: float
     rate: float
     u_rate: float
+    phase_rad: float
 
     @property
     def significant(self) -> bool:
@@ -63,7 +69,11 @@ def drift(windows: Sequence[Window]) -> LagDrift | None:
     inverse = np.linalg.pinv(products[:2, :2], hermitian=True)
     line = inverse @ products[:2, 2]
     scatter = float(products[2, 2] - line @ products[:2, 2]) / (len(lag_s) - 2)
-    return LagDrift(middle, float(line[0]), float(line[1]), float(np.sqrt(inverse[1, 1] * max(scatter, 1.0))))
+    beyond_noise_s = float(np.sqrt(max(scatter - 1.0, 0.0) * len(lag_s) / weight.sum()))
+    furthest_s = float(np.abs(line[0] + line[1] * (np.array([time_s.min(), time_s.max()]) - middle)).max())
+    phase_rad = largest_omega([w for w, _ in told]) * max(furthest_s, beyond_noise_s)
+    u_rate = float(np.sqrt(inverse[1, 1] * max(scatter, 1.0)))
+    return LagDrift(middle, float(line[0]), float(line[1]), u_rate, phase_rad)
 
 
 def u_common_lag_s(window: Window) -> float:
@@ -71,13 +81,14 @@ def u_common_lag_s(window: Window) -> float:
     sensitivities may tell of V in the place of a lag. inf where noise alone is left of du/dt.
     """
     whole, m = pool(window.sums), window.sums.reference_channels
-    power = whole.scatter[0]
+    power, own = whole.scatter[0], own_channels(m)
     direct, noise = _of_window(window.sums)
-    shared = np.linalg.pinv(power[:m, :m], rcond=UNSEEN, hermitian=True) @ power[:m, m : 2 * m]
-    left = power[m : 2 * m, m : 2 * m] - power[m : 2 * m, :m] @ shared
-    if window.reference_noise is not None and len(window.reference_noise[0]) == m:
-        own, of_rate = whole.count[0] * window.reference_noise**2
-        left_by_noise = np.diag(of_rate) + shared.T @ (own[:, None] * shared)
+    direct, rates = direct[:own], slice(m, m + own)
+    shared = np.linalg.pinv(power[:m, :m], rcond=UNSEEN, hermitian=True) @ power[:m, rates]
+    left = power[rates, rates] - power[rates, :m] @ shared
+    if window.reference_noise is not None:
+        of_u, of_rate = whole.count[0] * window.reference_noise**2
+        left_by_noise = np.diag(of_rate) + shared[:own].T @ (of_u[:, None] * shared[:own])
         left = left - (1.0 + NOISE_LEFT) * left_by_noise
     told = np.maximum(np.einsum("ji,jk,ki->i", direct, left, direct), 0.0)
     return float(np.sqrt(told @ noise) / told.sum()) if told.any() else np.inf
@@ -90,11 +101,12 @@ def segment_lags(window: Window) -> Array:
     segment without motion has no row.
     """
     sums = window.sums
-    m = sums.reference_channels
+    m, own = sums.reference_channels, own_channels(sums.reference_channels)
     direct, noise = _of_window(sums)
-    u, du, out = slice(0, m), slice(m, 2 * m), slice(2 * m, 2 * m + 3)
-    power = np.einsum("ji,kjl,li->ki", direct, sums.scatter[:, du, du], direct)  # of b'du/dt, (K, 3)
-    common = np.einsum("ji,kji->ki", direct, sums.scatter[:, du, out] - sums.scatter[:, du, u] @ direct)
+    u, du, out = slice(0, m), slice(m, m + own), slice(2 * m, 2 * m + 3)
+    moves = direct[:own]
+    power = np.einsum("ji,kjl,li->ki", moves, sums.scatter[:, du, du], moves)  # of b'du/dt, (K, 3)
+    common = np.einsum("ji,kji->ki", moves, sums.scatter[:, du, out] - sums.scatter[:, du, u] @ direct)
     size = power.sum(axis=1)
     told = size > 0.0
     ends = np.cumsum(sums.count)
@@ -104,10 +116,13 @@ def segment_lags(window: Window) -> Array:
 
 
 def _of_window(sums: WindowSums) -> tuple[Array, Array]:
-    """Coefficients (m, 3) on u from the regression of a whole window on u and du/dt, and its residual variance (3,)."""
+    """Coefficients (m, 3) on u from the regression of a whole window on u and du/dt, and its residual variance (3,).
+
+    Integrals of an AC-coupled reference belong to u; their derivative is u once more, and is left out.
+    """
     m = sums.reference_channels
     part = factor(sums, derivative=True)
-    slopes, *_ = np.linalg.lstsq(part.r[1:, 1:], part.rhs[1:], rcond=UNSEEN)
+    slopes, *_ = np.linalg.lstsq(part.r[1:, 1 : 1 + m + own_channels(m)], part.rhs[1:], rcond=UNSEEN)
     variance = np.diag(part.residual) / max(part.count - 2 * m - 1, 1.0)
     power = np.diag(part.rhs.T @ part.rhs) / part.count
     return np.asarray(slopes[:m]), np.maximum(variance, NOISE_FLOOR**2 * power.max())

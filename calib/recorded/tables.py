@@ -19,10 +19,11 @@ from calib.excitation.front_end import (
     nothing_in,
     windows_of,
 )
+from calib.excitation.lag_search import BASIN_RAD, correlated_lag
 from calib.excitation.pieces import pieces_of
 from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
-from calib.recorded.alignment import LagDrift, drift
+from calib.recorded.alignment import drift
 from calib.recorded.errors import InputError
 from calib.recorded.poses import PoseInterval
 from calib.recorded.segments import segments_joined, with_joined
@@ -35,6 +36,8 @@ from calib.signal.samples import Samples
 from calib.windows.bands import HANN
 
 HIGHEST_LIMIT = 0.4  # of the sampling rate: a limit above leaves nothing to remove
+MOST_RATE = 2e-4  # by which the rates of two clocks are supposed to differ at most: quartz clocks differ by 1e-4
+NEAR_RAD = 0.1  # phase of the motion: lags that are told from the windows, and their changes, are right to a per cent
 GUARD_S = 0.1  # not used at both ends of a pose, because of handling and of errors of the clocks
 
 
@@ -69,9 +72,7 @@ class Tables:
         self._sensor = TableStream(sensor.name, sensor.time_s, sensor.v)
         self._reference = None if reference is None else TableStream(reference.name, reference.time_s, reference.x)
         self._instrument = instrument
-        self.drift: LagDrift | None = (
-            None  # of the sensor's clock against the reference's; None until windows were made
-        )
+        self._phase_rad = np.inf  # that the lag may still have somewhere in the windows; inf until they told it
         self.poses = poses
         first_s, end_s = self._sensor.span_s
         length_s = sum(max(min(p.stop_s, end_s) - max(p.start_s, first_s), 0.0) for p in poses)
@@ -98,21 +99,39 @@ class Tables:
         """All windows in the order of the poses, used or not. `lag_s` is the lag of the sensor's indications, and
         `response` their response over frequency.
 
-        The first call finds whether the two clocks have different rates, and corrects that. `progress` is called with
-        the seconds of recording that were just done. With `steady` False windows whose mean changes are used as well:
-        a response that is not yet taken out can look like it.
+        Until the lag that is left is small, each call finds whether the two clocks have different rates, and corrects
+        that. `progress` is called with the seconds of recording that were just done. With `steady` False windows whose
+        mean changes are used as well: a response that is not yet taken out can look like it.
         """
         settings = self._making.settings
         if not steady:
             settings = replace(settings, limits=settings.limits.unsteady)
         found = self._made(settings, lag_s, response, progress)
-        if self._making.align and self._reference is not None and self.drift is None:
-            self.drift = drift(found)
-            if self.drift is not None and self.drift.significant:
-                self._reference.stretch(self.drift.rate, self.drift.time_s)
+        if not self._making.align or self._reference is None or self._phase_rad <= NEAR_RAD:
+            return found
+        if (told := drift(found)) is not None:
+            self._phase_rad = told.phase_rad
+            if self._phase_rad <= BASIN_RAD and told.significant:
+                self._reference.stretch(told.rate, told.time_s)
                 del found  # of a day, it would need as much memory once more
                 return self._made(settings, lag_s, response, progress)
         return found
+
+    @property
+    def far(self) -> bool:
+        """Whether the windows made last show lags that are too large to tell the lag, or the rate of a clock."""
+        return BASIN_RAD < self._phase_rad < np.inf
+
+    def likely_lag_s(self, furthest_s: float, omega: float) -> float:
+        """The lag in s by cross-correlation, up to `furthest_s` to both sides, where `omega` is the angular frequency of
+        the motion in rad/s; 0 without motion. What the rates of the two clocks differ is corrected."""
+        found = correlated_lag(self._stretches(), furthest_s, MOST_RATE, omega)
+        if found is None or self._reference is None:
+            return 0.0
+        lag_s, rate, at_s = found
+        if rate:
+            self._reference.stretch(rate, at_s)
+        return lag_s
 
     def within(self, band_hz: tuple[float, float]) -> Tables:
         """The same with both signals limited alike to a band: half of an amplitude is left at its ends, and hardly
@@ -219,8 +238,9 @@ class Tables:
                     stop = int(np.searchsorted(found.points.time_s, window.stop_s, side="right"))
                     yield found.points.part(first, stop), window
 
-    def stretches(self) -> Iterator[tuple[Array, Array]]:
-        """Evenly spaced samples of the sensor (n, 3) and of the reference (n, m) where there is motion, not filtered.
+    def _stretches(self) -> Iterator[tuple[Array, Array, Array]]:
+        """Times (n,) and evenly spaced samples of the sensor (n, 3) and of the reference (n, m) where there is motion,
+        not filtered.
 
         Missing samples are interpolated.
         """
@@ -231,7 +251,7 @@ class Tables:
                 if found is not None:
                     t, V, u, *_ = found.points
                     even_s = np.arange(t[0], t[-1], 1.0 / self.rate_hz)
-                    yield _interpolated(even_s, t, V), _interpolated(even_s, t, u)
+                    yield even_s, _interpolated(even_s, t, V), _interpolated(even_s, t, u)
 
     def points(self, interval: PoseInterval, start_s: float, stop_s: float, lag_s: float = 0.0) -> Points | None:
         """Samples of the sensor from `start_s` to `stop_s`, knocks included.

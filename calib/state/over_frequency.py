@@ -12,14 +12,13 @@ import numpy as np
 from calib.estimate.estimate import Now
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE, Quantity
-from calib.estimate.response_told import KnownResponses, ResponseTold, response_told, told_at_one_frequency
+from calib.estimate.response_told import LEFT_U, KnownResponses, ResponseTold, response_told, told_at_one_frequency
 from calib.model import Array
 from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, attenuating, by_term, in_units
 from calib.windows.deviations import Deviations, LeftOpen
 from calib.windows.record import WIDER, Record
 
 KNOWN = 0.03  # standard uncertainty of ln h
-LEFT_U = 1.0  # standard uncertainties of ln h that may be left in a window
 SURELY = 4.0  # standard uncertainties
 SEVERAL = 8  # windows that settle the band
 ANOTHER_OCTAVES = np.array([1.0, 1.0 / 3.0])  # two windows of one motion differ by less in their lower and upper ends
