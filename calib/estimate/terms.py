@@ -22,6 +22,7 @@ from calib.signal.response import ALL_POWERS, by_term
 from calib.windows.deviations import ByAxis, LeftOpen
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
+SETUP_DEG = 1  # angles between motion and gravity that are measured by hand differ by less
 AXES = "xyz"
 
 
@@ -227,18 +228,24 @@ def _lean_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
 
 
 def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
-    """Motion transverse to a uniaxial reference, and errors of the angle between gravity and the motion."""
+    """Motion transverse to a uniaxial reference, and errors of the angle between gravity and the motion.
+
+    What moves the sensor moves it sideways alike in all positions, as long as it stands alike: where stated directions
+    are at another angle to gravity, it was set up anew, or each position by hand.
+    """
     lateral, vertical, along = (np.zeros((len(poses), 3)) for _ in range(3))
+    setups: dict[str, list[int]] = {}
     free = []
     for p, pose in enumerate(poses):
         frame = _slide_frame(pose)
         if frame is not None:
             along[p], vertical[p], lateral[p] = frame
+            setups.setdefault(_setup(pose), []).append(p)
         elif own_channels(pose.direction.shape[1]) == 1:
             free.append(p)
-    for name, way in (("lateral", lateral), ("vertical", vertical)):
-        if way.any():
-            yield from _across(f"transverse_{name}", "", priors, way)
+    for setup, alike in setups.items():
+        for name, way in (("lateral", lateral), ("vertical", vertical)):
+            yield from _across(f"transverse_{name}{setup}", "", priors, _only(poses, alike, way[alike]))
     for p in free:
         position = poses[p].position
         for name, k in zip("ab", np.linalg.svd(poses[p].direction[:, :1])[0].T[1:], strict=True):
@@ -271,6 +278,16 @@ def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
     if length <= PARALLEL * max(float(np.linalg.norm(gravity)), np.finfo(float).tiny):
         return None
     return motion, np.cross(motion, across / length), across / length
+
+
+def _setup(pose: Pose) -> str:
+    """The name of how that stands which moves a sensor whose direction of motion is stated: by its angle to gravity, to
+    SETUP_DEG. "" on a slide, which is one thing at any inclination."""
+    if pose.theta_rad is not None:
+        return ""
+    motion, gravity = pose.direction[:, 0], pose.gravity_mps2
+    cosine = float(motion @ gravity) / float(np.linalg.norm(motion) * np.linalg.norm(gravity))
+    return f" at {SETUP_DEG * round(float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))) / SETUP_DEG)} deg"
 
 
 def _clamp_frame(pose: Pose) -> tuple[Array, Array]:

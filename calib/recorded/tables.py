@@ -72,6 +72,7 @@ class Tables:
         self._sensor = TableStream(sensor.name, sensor.time_s, sensor.v)
         self._reference = None if reference is None else TableStream(reference.name, reference.time_s, reference.x)
         self._instrument = instrument
+        self.rate = 0.0  # by which the reference's times were made to run faster
         self._phase_rad = np.inf  # that the lag may still have somewhere in the windows; inf until they told it
         self.poses = poses
         first_s, end_s = self._sensor.span_s
@@ -112,7 +113,7 @@ class Tables:
         if (told := drift(found)) is not None:
             self._phase_rad = told.phase_rad
             if self._phase_rad <= BASIN_RAD and told.significant:
-                self._reference.stretch(told.rate, told.time_s)
+                self._stretch(told.rate, told.time_s)
                 del found  # of a day, it would need as much memory once more
                 return self._made(settings, lag_s, response, progress)
         return found
@@ -130,8 +131,13 @@ class Tables:
             return 0.0
         lag_s, rate, at_s = found
         if rate:
-            self._reference.stretch(rate, at_s)
+            self._stretch(rate, at_s)
         return lag_s
+
+    def _stretch(self, rate: float, at_s: float) -> None:
+        assert self._reference is not None
+        self._reference.stretch(rate, at_s)
+        self.rate += rate
 
     def within(self, band_hz: tuple[float, float]) -> Tables:
         """The same with both signals limited alike to a band: half of an amplitude is left at its ends, and hardly

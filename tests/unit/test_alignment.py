@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib import calibrate
 from calib.excitation.windows import Points, motion_windows
 from calib.geometry import beside, clamp
 from calib.model import Pose, Window
@@ -110,11 +111,9 @@ def tables(ppm: float) -> tuple[SensorTable, ReferenceTable, list[PoseInterval]]
 def test_free_running_clocks_cost_nothing_once_aligned() -> None:
     sensor, reference, poses = tables(40.0)  # 7 ms apart in the end
     front = Tables(sensor, reference, poses, Instrument())
-    front.windows()
-    assert front.drift is not None
+    lag_s = drift(front.windows()).lag_s
     # The reference's stamps run ahead: the sensor's lag behind them less and less.
-    assert front.drift.rate == pytest.approx(-40e-6, abs=5e-7)
-    lag_s = front.drift.lag_s
+    assert front.rate == pytest.approx(-40e-6, abs=5e-7)
     aligned = fit(front.windows(lag_s))
     as_they_are = fit(Tables(sensor, reference, poses, Instrument(), Making(align=False)).windows(lag_s))
     assert aligned.residual_sd.max() < 0.015 < 0.1 < as_they_are.residual_sd.max()
@@ -125,5 +124,39 @@ def test_free_running_clocks_cost_nothing_once_aligned() -> None:
 def test_clocks_in_step_are_left_alone() -> None:
     front = Tables(*tables(0.0), Instrument())
     front.windows()
-    assert front.drift is not None
-    assert not front.drift.significant
+    assert front.rate == 0.0
+
+
+# Minutes of motion up to a frequency in Hz, by how many ppm the sensor's clock is slow, and its lag in s.
+APART = {"a lag": (4, 20.0, 20.0, -0.02), "a tenth of a second": (12, 8.0, 150.0, 0.01), "in step": (4, 20.0, 0.0, 0.02)}
+
+
+@pytest.mark.parametrize("reference", ["dc", "ac"])
+@pytest.mark.parametrize(("minutes", "to_hz", "ppm", "lag_s"), APART.values(), ids=APART)
+def test_clocks_that_run_apart_beside_a_lag(
+    minutes: int, to_hz: float, ppm: float, lag_s: float, reference: str
+) -> None:
+    """A lag of half a period of the fastest motion, or clocks that are half a period apart in the end: what windows tell
+    of the lag is of first order in it, and of twice the size here."""
+    rng, rate_hz, length = np.random.default_rng(7), 100.0, 10.0 * minutes
+    t = np.arange(round(6 * length * rate_hz)) / rate_hz
+    lines = np.fft.rfft(rng.normal(size=len(t)))
+    at_hz = np.fft.rfftfreq(len(t), 1.0 / rate_hz)
+    lines[(at_hz < 1.0) | (at_hz > to_hz)] = 0.0
+    lines /= np.fft.irfft(lines, len(t)).std()
+    a = np.fft.irfft(lines, len(t))
+    shown = np.fft.irfft(lines / (1.0 + 0.1 / (1j * np.maximum(at_hz, 1e-9))), len(t)) if reference == "ac" else a
+    ways = np.vstack([np.eye(3), 0.6 * np.eye(3) + 0.8 * np.roll(np.eye(3), 1, axis=1)])
+    poses = [
+        {"start_s": k * length + 1, "stop_s": (k + 1) * length - 1, **dict(zip(("dx", "dy", "dz"), d, strict=True)),
+         "gx": 0.0, "gy": 0.0, "gz": 9.81}
+        for k, d in enumerate(ways.tolist())
+    ]  # fmt: skip
+    felt = a[:, None] * ways[np.minimum(t // length, 5).astype(int)] + [0.0, 0.0, 9.81]
+    V = felt @ S.T + 0.1 + 0.01 * rng.normal(size=(len(t), 3))
+    ac = {"reference_coupling": "ac", "reference_corner_hz": 0.1} if reference == "ac" else {}
+    found = calibrate(((t + lag_s) * (1.0 + ppm * 1e-6), V), {"time_s": t, "a": shown}, poses=poses, **ac)
+    assert found.status == "valid", found.reasons
+    u = found.standard_uncertainty.ravel()[:9].reshape(3, 3)
+    assert (np.abs(found.sensitivity - S) < 4.0 * u).all()
+    assert (np.diag(u) < 2e-3).all()
