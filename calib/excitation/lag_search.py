@@ -134,10 +134,10 @@ def correlated_lag(
     changes in a second, where the two clocks run apart; and the time in s at which it is this lag.
 
     `parts` are stretches of evenly spaced samples: times (n,) in s, V (n, 3) and u (n, m). Lags up to `furthest_s` to
-    both sides and changes up to `most_rate` are compared; `omega` is the angular frequency of the motion in rad/s. Where
-    several peaks are almost equally high, as in motion of one frequency, that of the slowest change, and of these the
-    one nearest to 0 counts. None if there is no motion. The lag is right to a sample, or to an eighth of a period at
-    both ends of the parts; `without_lag` leads from there to the lag.
+    both sides and changes up to `most_rate` are compared; `omega` is the angular frequency of the motion in rad/s.
+    Where several peaks are almost equally high, as in motion of one frequency, that of the slowest change counts, and
+    of these the one nearest to 0. None if there is no motion. The lag is right to a sample, or to an eighth of a period
+    at both ends of the parts; `without_lag` leads from there to the lag.
     """
     cut = [piece for part in parts for piece in _pieces(*part)]
     cut = cut[:: -(-len(cut) // MOST_PIECES)] if cut else []

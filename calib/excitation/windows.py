@@ -237,6 +237,9 @@ def _motion(
     finest = detection.least_step(V)
     struck, residual = detection.knocked(V, basis, finest)
     struck = struck if known is None else struck | known
+    if struck.all():  # no response of the sensor makes such a window a sound one
+        sums, limits = _sums(V, u, du, rate_hz, limits), replace(limits, most_left_out_pct=0.0)
+        return _window(kind, pose, t, sums, judge(sums, struck, {}, limits), 0)
     stepped = stepped or step(residual, rate_hz)
     sound = _sound(struck, rate_hz, limits)
     if leave_out and not sound.all():

@@ -124,8 +124,8 @@ class Tables:
         return BASIN_RAD < self._phase_rad < np.inf
 
     def likely_lag_s(self, furthest_s: float, omega: float) -> float:
-        """The lag in s by cross-correlation, up to `furthest_s` to both sides, where `omega` is the angular frequency of
-        the motion in rad/s; 0 without motion. What the rates of the two clocks differ is corrected."""
+        """The lag in s by cross-correlation, up to `furthest_s` to both sides; 0 without motion. `omega` is the angular
+        frequency of the motion in rad/s. What the rates of the two clocks differ is corrected."""
         found = correlated_lag(self._stretches(), furthest_s, MOST_RATE, omega)
         if found is None or self._reference is None:
             return 0.0

@@ -132,7 +132,7 @@ def without_slow(x: Array, rate_hz: float, from_hz: float) -> Array:
     mean = hanning(2 * half + 3)[1:-1]
     once = -mean / mean.sum()
     once[half] += 1.0
-    whole = np.nanmean(x, axis=0)
+    whole = np.nansum(x, axis=0) / np.maximum(np.isfinite(x).sum(axis=0), 1)
     return np.asarray(convolved(x - whole, np.convolve(once, once)) + whole)
 
 

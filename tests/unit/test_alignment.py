@@ -128,7 +128,11 @@ def test_clocks_in_step_are_left_alone() -> None:
 
 
 # Minutes of motion up to a frequency in Hz, by how many ppm the sensor's clock is slow, and its lag in s.
-APART = {"a lag": (4, 20.0, 20.0, -0.02), "a tenth of a second": (12, 8.0, 150.0, 0.01), "in step": (4, 20.0, 0.0, 0.02)}
+APART = {
+    "a lag": (4, 20.0, 20.0, -0.02),
+    "a tenth of a second": (12, 8.0, 150.0, 0.01),
+    "in step": (4, 20.0, 0.0, 0.02),
+}
 
 
 @pytest.mark.parametrize("reference", ["dc", "ac"])
@@ -136,8 +140,8 @@ APART = {"a lag": (4, 20.0, 20.0, -0.02), "a tenth of a second": (12, 8.0, 150.0
 def test_clocks_that_run_apart_beside_a_lag(
     minutes: int, to_hz: float, ppm: float, lag_s: float, reference: str
 ) -> None:
-    """A lag of half a period of the fastest motion, or clocks that are half a period apart in the end: what windows tell
-    of the lag is of first order in it, and of twice the size here."""
+    """A lag of half a period of the fastest motion, or clocks that are half a period apart in the end: what windows
+    tell of the lag is of first order in it, and of twice the size here."""
     rng, rate_hz, length = np.random.default_rng(7), 100.0, 10.0 * minutes
     t = np.arange(round(6 * length * rate_hz)) / rate_hz
     lines = np.fft.rfft(rng.normal(size=len(t)))

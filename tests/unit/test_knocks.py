@@ -7,7 +7,9 @@ import pytest
 
 from calib.excitation.front_end import Aligned, Settings, aligned, windows_of
 from calib.excitation.knocks import knocks
-from calib.geometry import beside
+from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits
+from calib.excitation.windows import Points, motion_windows
+from calib.geometry import beside, clamp
 from calib.model import Array
 from calib.recorded.outcome import Outcome
 from calib.signal.instrument import Instrument
@@ -202,3 +204,16 @@ def test_the_sensor_turned_before_and_after_the_stretch_is_left_as_it_is() -> No
     flagged = made.flagged(turned + made.ring(np.array([30.0]), 8.0))
     assert flagged.any()
     assert not flagged[(made.at_s < 29.9) | (made.at_s > 30.5)].any()
+
+
+@pytest.mark.parametrize("limits", [DEFAULT_LIMITS, DEFAULT_LIMITS.of_any_response])
+def test_a_window_of_knocks_alone_is_refused(limits: Limits) -> None:
+    """A piece between two knocks that lies within what both leave out; there is nothing that sums can be made of."""
+    t = np.arange(400) / 100.0
+    u = np.sin(2.0 * np.pi * 3.0 * t)[:, None]
+    du = 6.0 * np.pi * np.cos(6.0 * np.pi * t)[:, None]
+    points = Points(t, u * [0.6, 0.64, 0.48], u, du, np.ones(len(t), dtype=bool))
+    found = motion_windows(clamp(0.5, 0.3), points, limits)
+    assert found
+    assert not any(window.used for window in found)
+    assert "100.0 % of the points are knocks" in found[0].reason
