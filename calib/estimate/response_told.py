@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 PER_OCTAVE = 3  # bands in which S is reported
 GRID = 200  # frequencies at which the valid band is searched
-LEFT_U = 2.0  # standard uncertainties of ln h that may be left in the windows: what is of second order in them is small
+LEFT_U = 1.0  # standard uncertainties of ln h that may be left in the windows
 
 
 @dataclass(frozen=True, slots=True)

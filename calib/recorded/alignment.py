@@ -45,6 +45,11 @@ class LagDrift:
         """Whether the data show that the two clocks run apart."""
         return abs(self.rate) > max(SIGNIFICANT * self.u_rate, LEAST_RATE)
 
+    @property
+    def improves(self) -> bool:
+        """Whether clocks that run apart, and were corrected before, run apart less after this is corrected as well."""
+        return abs(self.rate) > self.u_rate
+
 
 def drift(windows: Sequence[Window]) -> LagDrift | None:
     """The straight line through the lags of all segments of the used windows of kind "motion" that tell a lag.

@@ -112,7 +112,7 @@ class Tables:
             return found
         if (told := drift(found)) is not None:
             self._phase_rad = told.phase_rad
-            if self._phase_rad <= BASIN_RAD and told.significant:
+            if self._phase_rad <= BASIN_RAD and (told.significant if not self.rate else told.improves):
                 self._stretch(told.rate, told.time_s)
                 del found  # of a day, it would need as much memory once more
                 return self._made(settings, lag_s, response, progress)
