@@ -6,6 +6,7 @@ import * as events from "./events.js";
 import * as fleet from "./fleet.js";
 import { duration, setNow } from "./format.js";
 import * as live from "./live.js";
+import { chip, KINDS } from "./parts.js";
 import * as plan from "./plan.js";
 import * as sensor from "./sensor.js";
 
@@ -153,6 +154,7 @@ addEventListener("hashchange", show);
 document.addEventListener("visibilitychange", follow);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { sensor.leave(); bench.leave(); show(); });
 for (const one of Object.values(VIEWS)) one.start?.(go);
+$("meanings").append(...Object.entries(KINDS).flatMap(([kind, [, , meaning]]) => [make("dt", chip(kind)), make("dd", meaning)]));
 $("zone").textContent = Intl.DateTimeFormat().resolvedOptions().timeZone;
 setInterval(() => { if (told && !$("fleet").hidden) fleet.show(told, go); }, 30000); // ages grow without a change
 setInterval(showOpenBench, 5000); // so does the silence of a bench

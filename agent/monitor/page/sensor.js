@@ -106,10 +106,9 @@ function showMatrix(newest, row, trends) {
   };
   const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
   const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);
-  const Q = AXES.map((axis, i) => make("td", [rounded(newest.offset[i], 2 * newest.standard_uncertainty[9 + i]), make("small", `± ${two(2 * newest.standard_uncertainty[9 + i])}`)], { title: `Q${axis}`, class: moved.has(`Q${axis}`) ? "moved" : "" }));
   const at = [`At ${two(newest.reference_frequency_hz)} Hz`, newest.valid_band_hz?.length === 2 ? `; right within U/3 from ${band(newest.valid_band_hz)}` : "", ". U with k = 2 below each value; “moved”: its change since the accepted calibration over U of that change."];
   $("matrix").replaceChildren(make("table", [make("caption", "S in force", { class: "hidden" }), make("thead", head), make("tbody", rows)], { class: "matrix" }),
-    make("table", [make("caption", `Offset Q, ${clean(newest.output_unit)}`), make("tbody", make("tr", Q))], { class: "matrix" }), make("p", at, { class: "hint" }));
+    make("table", [make("caption", `Offset Q, ${clean(newest.output_unit)}`), make("tbody", make("tr", AXES.map((_, i) => cell(9 + i))))], { class: "matrix" }), make("p", at, { class: "hint" }));
 }
 
 function showBudget(newest, row, trends) {
