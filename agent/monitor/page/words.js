@@ -97,11 +97,12 @@ function steady(row) {
 }
 
 // What the other sensors with the same reference say of it.
+const clearsReference = (beside) => beside?.count > 0 && beside.changed * 2 < beside.count;
 function witnessed(beside) {
   if (!beside) return "";
   if (!beside.count) return "No other sensor with this reference can witness: nothing here tells sensor from reference.";
   const others = `${beside.count - beside.changed} of ${beside.count} other sensors with the same reference are steady`;
-  return beside.changed * 2 >= beside.count ? `Only ${others}: look at the reference first.` : `${others}: rather this sensor than its reference.`;
+  return clearsReference(beside) ? `${others}: rather this sensor than its reference.` : `Only ${others}: look at the reference first.`;
 }
 
 // The present of a sensor: the time that its gateway has reached while it catches up, as a simulated one may.
@@ -144,13 +145,17 @@ function inWords({ best, alike, fits, least, limit }) {
   return [`${COUNTS[all.length] ?? all.length} explanations fit about equally: `, ...named, fits ? ` ${chi2}.` : `; none fits within chance ${chi2}.`];
 }
 
+// A gateway cannot tell another reference from another sensor; whether others with this reference contradict it.
+const blamesReference = (why) => Boolean(why?.best) && [why.best, ...why.alike].every((each) => each.startsWith("reference "));
+const isContradicted = (why, trends) => blamesReference(why) && clearsReference(trends?.beside);
+
 const ON_HOLD = /^put on hold by/;
 
 // {say, more} of a sensor that is held, perhaps with a step.
 function heldWords(row, verdicts, trends) {
   const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason);
   const reason = why ? [`${why.held} windows ${why.agree ? "agree with what the calibration may have become." : "contradict the calibration."}`] : [row.reason, "."];
-  return { say: [...since, ...(verdicts.length ? inTurn(verdicts) : reason)], more: [...(why ? [...inWords(why), " "] : verdicts.length ? [...reason, " "] : []), ON_HOLD.test(row.reason) ? "" : witnessed(trends?.beside)] };
+  return { say: [...since, ...(verdicts.length ? inTurn(verdicts) : reason)], more: [...(why ? [...inWords(why), " "] : verdicts.length ? [...reason, " "] : []), ON_HOLD.test(row.reason) ? "" : `${isContradicted(why, trends) ? "But " : ""}${witnessed(trends?.beside)}`] };
 }
 
 // What is said of a sensor that is in order: its largest change of a main sensitivity, and what was adopted.
@@ -192,8 +197,10 @@ export function told(row, trends) {
 const BELOW = " by the command below";
 // What the agent says there is to do, without the command, which stands below; the mount where it knows nothing better.
 // Since it said that no estimate can be put in force one may have come (`waits`).
-function advice(reason, waits) {
-  const why = explanation(reason), todo = waits ? why?.todo.replace(/ Otherwise: no estimate can be put in force.*$/, "") : why?.todo;
+function advice(reason, waits, trends) {
+  const why = explanation(reason);
+  if (isContradicted(why, trends)) return "Look at the sensor and its mount: its gateway names the reference, but other sensors with this reference are steady.";
+  const todo = waits ? why?.todo.replace(/ Otherwise: no estimate can be put in force.*$/, "") : why?.todo;
   const told = why?.best && todo.replace(/: fieldcal command accept --sequence \d+$/, BELOW).replace(/([^.])$/, "$1.");
   if (told?.startsWith("Correct it")) return `Another ${make("span", cause(why.best)).textContent}? ${told}`;
   return told || "Look at the mount. If it is loose, fasten it: windows that fit again end HELD.";
@@ -208,7 +215,7 @@ export function steps(row, trends) {
   const gateway = clean(`${row.site}/${row.gateway}`), order = (verb, given) => commandLine({ gateway, sensor: row.sensor, verb, arguments: given }, "--connect ENDPOINT"), here = `on gateway ${gateway}:`;
   const visit = () => [make("p", `Compare it with another reference, ${here}`), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`)];
   const waits = row.estimate && row.estimate_utc_ns >= (trends?.held_utc_ns ?? row.status_utc_ns) && row.status === "HELD";
-  const told = row.kind === "held" ? advice(row.reason, waits) : "", asked = told.includes(BELOW) ? `Run it ${KEYED}` : `If the sensor has really changed, accept estimate ${row.estimate}, ${KEYED}`;
+  const told = row.kind === "held" ? advice(row.reason, waits, trends) : "", asked = told.includes(BELOW) ? `Run it ${KEYED}` : `If the sensor has really changed, accept estimate ${row.estimate}, ${KEYED}`;
   const accept = waits ? [make("p", asked), copier(order("accept", { sequence: row.estimate }))] : [];
   if (row.kind === "silent") return [make("p", `Look at power and network, then ${here}`), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "changed") return [make("p", "Find out what happened to it: mount, cable, temperature, reference."), ...visit()];
