@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,8 @@ from tests.unit.zenoh_site import Site
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 from agent.monitor.settings import FloorPlan
-from tests.scenarios.fleet_page import IMAGES
-from tests.unit.monitor_site import Served
+from tests.scenarios.fleet_page import DAY_NS, IMAGES
+from tests.unit.monitor_site import Monitor, Served
 
 pytestmark = needs_chromium
 SHIFTS = """
@@ -101,7 +102,7 @@ MORE_OF = """async ([reason, count, changed]) => {
     const row = { kind: 'held', status: 'HELD', status_utc_ns: 1, reason, verdicts: [] }, trends = { beside: { count, changed } };
     return [make('p', told(row, trends).more).textContent, make('p', steps(row, trends)).textContent];
 }"""  # noqa: E501
-DAY = "k => new Date(Date.now() - (59 - k) * 432e6).toLocaleString(undefined, { day: 'numeric', month: 'short' })"
+DAY = "k => new Date(Date.now() - (59 - k) * 432e6).toLocaleString('en-US', { day: 'numeric', month: 'short' })"
 ROWS_OF = """async (words) => (await import('./plots.js')).rowsOf(words.map(([from, to]) => ({ from, to })))"""
 CUT = "all => all.filter((c) => c.scrollWidth > c.clientWidth).map((c) => c.textContent)"
 # What changes a row of parts.html, and whether its values may be used then.
@@ -120,6 +121,7 @@ CHANGED = [
 ]
 
 
+RANGE = "() => [...['from', 'to'].map((n) => Number(new URLSearchParams(location.hash.slice(1)).get(n))), location.hash]"
 NUMBERS = itertools.count(1)  # of results of one gateway
 # The boxes of names, of points and of the picture.
 BOXES = """() => {
@@ -157,7 +159,8 @@ def test_each_kind_of_sensor_says_what_it_is_and_whether_its_values_may_be_used(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:
     with Served(site, tmp_path / "monitor") as served:
-        watched = Watched(browser, served.address, viewport={"width": 1440, "height": 900})
+        # Dates are English as the words are, whatever the language of the browser.
+        watched = Watched(browser, served.address, viewport={"width": 1440, "height": 900}, locale="fa-IR")
         page = watched.open("parts.html")
         page.locator("#numbers table").wait_for()
         cards = page.locator("#cards .card").evaluate_all(
@@ -236,6 +239,59 @@ def test_a_change_that_is_not_in_force_is_said_so_and_each_word_is_explained(
         watched.close()
 
 
+def test_the_plot_of_a_sensor_marks_what_happened(site: Site, tmp_path: Path, browser: Any) -> None:
+    with Served(site, tmp_path / "monitor") as served:
+        later = msgspec.structs.replace
+        first = later(calibration(1), references=["B12 4711"])
+        keep(
+            served, "mems", first, status(1),
+            later(first, t_utc_ns=first.t_utc_ns + DAY_NS, references=["B13 9"]),
+            later(first, t_utc_ns=first.t_utc_ns + 2 * DAY_NS, references=["B13 9"], made_sequence=1),
+            later(status(2, "RECALIBRATING", "5 windows agree"), before="HELD"),
+            later(status(3, "VALID", "put on hold by anna"), before="RECALIBRATING"), stepped(4, "Sxx"),
+        )  # fmt: skip
+        watched = Watched(browser, served.address, viewport={"width": 1440, "height": 900})
+        page = watched.open("#site=site&gateway=gw&sensor=mems")
+        plot = page.locator("#main-plot .plot")
+        page.locator("#main-plot .uplot").wait_for()
+        told = str(plot.get_attribute("aria-label"))
+        for mark in ("Sxx steps", "reference B13 9", "restart", "jump adopted", "operator"):
+            assert told.count(mark) == 1, told
+        page.locator("#main-plot").press("+")
+        page.wait_for_function("() => location.hash.includes('from=')")
+        for key, change in (("+", 0.5), ("ArrowRight", 1.0), ("-", 2.0)):
+            before = page.evaluate(RANGE)
+            page.locator("#main-plot").press(key)
+            page.wait_for_function("before => location.hash !== before[2]", arg=before)
+            after = page.evaluate(RANGE)
+            assert after[1] - after[0] == pytest.approx(change * (before[1] - before[0]), abs=2), key
+            assert (after[0] > before[0]) == (key != "-"), key
+        watched.close()
+
+
+def test_a_page_whose_monitor_hangs_looks_old_and_goes_on_when_it_answers_again(
+    site: Site, tmp_path: Path, browser: Any
+) -> None:
+    """Neither an end nor an error of the connection tells it, as where a computer sleeps."""
+    monitor = Monitor(site.endpoint, tmp_path / "monitor")
+    watched = Watched(browser, monitor.address)
+    watched.context.clock.install()
+    page = watched.open()
+    page.get_by_text("Sensors: 0").wait_for()
+    page.clock.run_for(30_000)
+    page.locator("main:not(.old)").wait_for()
+    monitor.send(signal.SIGSTOP)
+    page.clock.run_for(45_000)
+    page.get_by_text("the monitor does not answer since").wait_for()
+    page.locator("main.old").wait_for()
+    monitor.send(signal.SIGCONT)
+    page.clock.run_for(30_000)
+    page.locator("main:not(.old)").wait_for()
+    page.get_by_text("Sensors: 0").wait_for()
+    watched.close()
+    monitor.stop()
+
+
 def test_names_on_the_plan_cover_no_other(site: Site, tmp_path: Path, browser: Any) -> None:
     """Twelve sensors in three rows, so near that not all names find a place beside their points."""
     places = {f"site/gw/deck-{k:02}": ((k % 4) / 3, 0.3 + 0.02 * (k // 4)) for k in range(12)}
@@ -290,10 +346,22 @@ def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
         asked.wait_for(state="hidden")
         assert page.evaluate("() => moved") == 0  # what moves by a person's own click is not counted
         assert page.locator("#needs-count").inner_text() == "Needs a person: 2 things, 2 sensors"
-        for width in (1440, 820, 390):
+        # A sensor that is opened by a link is seen from its top, and who goes back is where the link was.
+        page.set_viewport_size({"width": 1440, "height": 500})
+        link = page.locator("#groups .row").nth(9).locator("a")
+        link.scroll_into_view_if_needed()
+        before = page.evaluate("() => scrollY")
+        link.click()
+        page.locator("#matrix table").first.wait_for()
+        assert (before > 500, page.evaluate("() => scrollY")) == (True, 0)
+        page.go_back()
+        page.locator("#groups .row").nth(9).wait_for()
+        page.wait_for_function("before => scrollY === before", arg=before)
+        for width in (1440, 1150, 1140, 1024, 820, 768, 721, 720, 600, 390, 320):
             page.set_viewport_size({"width": width, "height": 900})
             page.locator("#groups .row").first.wait_for()
             assert page.locator("#groups .row > *").evaluate_all(CUT) == [], width
+            assert page.locator("#sensors .row").evaluate_all(CUT) == [], width
         watched.close()
 
 

@@ -22,8 +22,10 @@ export const placeOf = (row) => new URLSearchParams({ site: row.site, gateway: r
 
 export class NeedsLogin extends Error {}
 
+const ANSWERS_MS = 20000; // a monitor that hangs must not leave old values unmarked
+
 export async function get(path) {
-  const answer = await fetch(path);
+  const answer = await fetch(path, { signal: AbortSignal.timeout(ANSWERS_MS) });
   if (answer.status === 401) throw new NeedsLogin();
   if (!answer.ok) throw new Error(await answer.text());
   return answer.json();

@@ -294,6 +294,7 @@ export function start() {
   $("fleet-png").addEventListener("click", picture);
   $("more-cards").addEventListener("click", () => { shownCards += 20; show(latest, changing); });
   document.addEventListener("visibilitychange", leave);
+  addEventListener("beforeprint", () => { for (const group of groups.values()) { group.seen = true; fill(group); } });
   $("new-cards").addEventListener("click", () => { order = null; show(latest, changing); });
   for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchmove"]) addEventListener(name, () => { touchedAt = performance.now(); }, { passive: true });
   $("fold").addEventListener("click", () => {
