@@ -21,7 +21,10 @@ PAGE = "agent/monitor/page"
 # Of pictures by the beginning of their names: sources, and modules of the page that draw them together with all that
 # these import.
 SOURCES: dict[str, tuple[str, ...]] = {
-    "run": ("docs/images/run_svg.py", *(f"agent/terminal/{name}.py" for name in ("screen", "wording", "watch", "state", "text"))),
+    "run": (
+        "docs/images/run_svg.py",
+        *(f"agent/terminal/{name}.py" for name in ("screen", "wording", "watch", "state", "text")),
+    ),
     "fleet": (
         "tests/scenarios/fleet_page.py", "agent/fleet/simulated_sensor.py", "agent/fleet/simulated_channel.py",
         "agent/monitor/trends.py", "agent/monitor/onset.py", f"{PAGE}/index.html", f"{PAGE}/page.css",

@@ -23,8 +23,8 @@ def test_the_sources_of_the_pictures_have_not_changed_since_they_were_made() -> 
         for beginning, found in now.items()
     }  # fmt: skip
     assert {beginning: names for beginning, names in stale.items() if names} == {}, (
-        "the sources of these pictures have changed: run `make pictures` and look at the pictures, or, where the change "
-        "is not seen in them, `.venv/bin/python -m docs.images.inputs`; commit what it writes"
+        "the sources of these pictures have changed: run `make pictures` and look at the pictures, or, where the "
+        "change is not seen in them, `.venv/bin/python -m docs.images.inputs`; commit what it writes"
     )
 
 

@@ -20,6 +20,9 @@ export const view = () => new URLSearchParams(location.hash.slice(1));
 export const full = (row) => `${row.site}/${row.gateway}/${row.sensor}`;
 export const placeOf = (row) => new URLSearchParams({ site: row.site, gateway: row.gateway, sensor: row.sensor });
 
+// Nothing comes from it.
+export const isUnheard = (row) => row.kind === "silent" || row.kind === "retired";
+
 export class NeedsLogin extends Error {}
 
 const ANSWERS_MS = 20000; // a monitor that hangs must not leave old values unmarked

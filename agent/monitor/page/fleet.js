@@ -30,7 +30,7 @@ function wanted(row, filter) {
 
 function showCounts(sensors, kind, go) {
   const count = (one) => sensors.filter((row) => row.kind === one).length;
-  const kinds = ["sound", "drifting", "held", "silent", ...["changed", "doubled", "no data", "uncalibrated"].filter(count)];
+  const kinds = ["sound", "drifting", "held", "silent", ...["changed", "doubled", "no data", "uncalibrated", "retired"].filter(count)];
   const key = JSON.stringify([kinds.map(count), sensors.length, kind]);
   if ($("counts").dataset.key === key) return;
   const focused = [...$("counts").children].indexOf(document.activeElement);
@@ -238,7 +238,7 @@ function showTable(sensors, gateways, filter) {
     if (many) size(group);
     put(group.button.children[0], `${rows[0].site} / ${rows[0].gateway}`);
     const state = states.get(name);
-    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? stateOf(state) : "not on the bus"}`);
+    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? stateOf(state) : state?.retired ? "retired" : "not on the bus"}`);
     if (group.built || group.seen) fill(group);
   }
   $("sensors").setAttribute("aria-rowcount", String(sensors.length));

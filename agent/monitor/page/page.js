@@ -49,7 +49,7 @@ async function show() {
 }
 
 function summary() {
-  const bus = told.bus, need = told.sensors.filter((row) => row.kind !== "sound").length;
+  const bus = told.bus, need = told.sensors.filter((row) => row.kind !== "sound" && row.kind !== "retired").length;
   return [
     `Sensors: ${told.sensors.length}`, need ? `${need} not in order` : "all in order", bus.verifies ? "signatures verified" : "signatures not verified (option --keys)",
     bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "", bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "",

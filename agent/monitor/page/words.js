@@ -1,6 +1,6 @@
 // What is said of a sensor: its verdicts in sentences, what else is steady, and what a person can do.
 import { commandLine } from "./commands.js";
-import { clean, make } from "./common.js";
+import { clean, isUnheard, make } from "./common.js";
 import { ago, AXES, band, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
 import { copier, spark } from "./parts.js";
 
@@ -69,7 +69,7 @@ export function covered(row, trends) {
   const until = good ? ["Values until the last window that fitted (", day(last), ") may be used: ", ...U, ". "] : [];
   if (row.kind === "uncalibrated" || !row.calibration_utc_ns) return ["off", [make("b", "Values may not be used yet"), ": no calibration is in force."]];
   if (row.kind === "doubled") return ["bad", [make("b", "Values may not be used"), ": two gateways have this name, and nobody knows whose calibration is shown."]];
-  if (row.kind === "silent") return ["off", [...until, make("b", "Of later values nobody knows"), "."]];
+  if (isUnheard(row)) return ["off", [...until, make("b", "Of later values nobody knows"), "."]];
   if (row.kind === "no data") return ["bad", [...until, make("b", "Later values may not be used"), ": no window has confirmed them."]];
   if (row.status === "HELD") {
     const hold = ON_HOLD.test(row.reason);
@@ -185,7 +185,7 @@ function silence(row) {
 export function told(row, trends) {
   const verdicts = findings(row, trends);
   const reason = row.reason ? [row.reason, "."] : [], since = trends?.held_utc_ns ?? row.status_utc_ns;
-  if (row.kind === "silent") return { say: silence(row), more: inTurn(verdicts.map((v) => ["Before: ", ...v])) };
+  if (isUnheard(row)) return { say: silence(row), more: inTurn(verdicts.map((v) => ["Before: ", ...v])) };
   if (row.kind === "doubled") return { say: ["Two gateways have this name, and their results are mixed."], more: inTurn(verdicts.map((v) => ["One of them: ", ...v])) };
   if (row.kind === "held") return heldWords(row, verdicts, trends);
   if (verdicts.length) return { say: inTurn(verdicts), more: [often(row, trends), ...steady(row), witnessed(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
@@ -233,7 +233,7 @@ export function steps(row, trends) {
 export function cardPlot(row, trends) {
   if (!trends?.t_utc_ns?.length) return [];
   const verdict = row.verdicts[0], trend = verdict && trends.found?.[verdict.parameter], beyond = trends.estimates ?? [], later = beyond.map((e) => e.t_utc_ns);
-  const marks = trends.refused_utc_ns ? [trends.held_utc_ns] : [], to = row.kind === "silent" ? trends.t_utc_ns.at(-1) : timeOf(row), stays = row.kind !== "silent" && row.kind !== "no data";
+  const marks = trends.refused_utc_ns ? [trends.held_utc_ns] : [], to = isUnheard(row) ? trends.t_utc_ns.at(-1) : timeOf(row), stays = !isUnheard(row) && row.kind !== "no data";
   const more = { marks, to, refused: trends.refused_utc_ns ?? [], dashed: later.length > 0 };
   if (!trend?.t_utc_ns.length) return [small(trends.main_pct.flatMap((v, i) => [going(trends.t_utc_ns, v, null, AXES[i], stays && to), ...estimated(later, beyond.map((e) => e.main_pct[i]), null, AXES[i])]), " %", "Main S", more)];
   const { unit, factor } = scaled(verdict.parameter, trend.scale), first = trend.values[0], k = NAMES.indexOf(verdict.parameter), tone = toneOf(verdict.parameter);
