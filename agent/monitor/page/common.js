@@ -25,7 +25,7 @@ export const isUnheard = (row) => row.kind === "silent" || row.kind === "retired
 
 export class NeedsLogin extends Error {}
 
-const ANSWERS_MS = 20000; // a monitor that hangs must not leave old values unmarked
+const ANSWERS_MS = 60000; // a monitor that hangs must not leave old values unmarked
 
 export async function get(path) {
   const answer = await fetch(path, { signal: AbortSignal.timeout(ANSWERS_MS) });
