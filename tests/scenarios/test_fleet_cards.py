@@ -22,6 +22,7 @@ from tests.unit.zenoh_site import Site
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+from agent.monitor import server
 from agent.monitor.settings import FloorPlan
 from tests.scenarios.fleet_page import DAY_NS, IMAGES
 from tests.unit.monitor_site import Monitor, Served
@@ -279,6 +280,19 @@ def test_the_plot_of_a_sensor_marks_what_happened(site: Site, tmp_path: Path, br
             after = page.evaluate(RANGE)
             assert after[1] - after[0] == pytest.approx(change * (before[1] - before[0]), abs=2), key
             assert (after[0] > before[0]) == (key != "-"), key
+        watched.close()
+
+
+def test_a_page_hears_its_monitor_while_nothing_changes(
+    site: Site, tmp_path: Path, browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "ALIVE_S", 0.5)
+    with Served(site, tmp_path / "monitor") as served:
+        watched = Watched(browser, served.address)
+        page = watched.open()
+        alive = "new EventSource('api/changes').addEventListener('alive', () => { heard += 1; })"
+        page.evaluate(f"() => {{ window.heard = 0; {alive}; }}")
+        page.wait_for_function("() => heard > 1", timeout=10_000)
         watched.close()
 
 
