@@ -22,9 +22,10 @@ from tests.unit.zenoh_site import Site
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
+pytest.importorskip("axe_playwright_python", reason="axe is not installed")
 from agent.monitor import server
 from agent.monitor.settings import FloorPlan
-from tests.scenarios.fleet_page import DAY_NS, IMAGES
+from tests.scenarios.fleet_page import DAY_NS, IMAGES, axe_faults
 from tests.unit.monitor_site import Monitor, Served
 
 pytestmark = needs_chromium
@@ -249,7 +250,10 @@ def test_a_change_that_is_not_in_force_is_said_so_and_each_word_is_explained(
         chips = page.evaluate("async () => Object.values((await import('./parts.js')).KINDS).map(([word]) => word)")
         assert words.all_inner_texts() == [*EXPLAINED_WORDS, *chips]
         assert all(page.locator("#words dd").evaluate_all("all => all.map((d) => d.textContent.length > 20)"))
-        assert page.locator("#words").evaluate("w => w.scrollWidth <= w.clientWidth")
+        for width in (1440, 390):
+            page.set_viewport_size({"width": width, "height": 900})
+            assert page.locator("#words").evaluate("w => w.scrollWidth <= w.clientWidth"), width
+            assert axe_faults(page) == []
         watched.close()
 
 
