@@ -272,7 +272,7 @@ export function show(told, go) {
   if (waits(told.sensors, told.gateways, filter)) return;
   showCards(told.sensors, told.gateways, filter);
   showTable(told.sensors, told.gateways, filter);
-  const rows = told.gateways.slice(0, GATEWAYS_MAX).map((g) => [gatewayOf(g), g.alive ? "yes" : "no", g.state, g.sensors, g.version, make("span", g.why, { class: "why" })]), key = JSON.stringify(told.gateways);
+  const rows = told.gateways.slice(0, GATEWAYS_MAX).map((g) => [gatewayOf(g), g.alive ? "yes" : "no", g.alive ? g.state : g.retired ? "retired" : "", g.sensors, g.version, make("span", g.why, { class: "why" })]), key = JSON.stringify(told.gateways);
   if ($("gateways").dataset.key !== key && !inHand($("gateways"))) {
     $("gateways").dataset.key = key;
     $("gateways").replaceChildren(table("Gateways", ["Gateway", "On the bus", "State", "Sensors", "Version", "Why a person is needed"], rows));
