@@ -29,10 +29,12 @@ fleet: $(VENV)/development  ## router, fleet page and a simulated fleet of 40 se
 	trap 'kill $$monitor 2>/dev/null; wait $$monitor; rm -r $$directory' EXIT; trap : INT TERM; \
 	$(BIN)/fieldcal simulate --fleet 10 --sensors 4 --every 4 --age 365 --speed 86400 --keys $$directory/known.keys
 
-pictures: $(VENV)/development  ## the pictures of README and docs that show running programs: terminal, fleet page, bench page
+pictures: $(VENV)/development  ## the pictures of README and docs that show running programs: terminal, pages of fleet and bench, report
 	$(BIN)/python -m docs.images.run_svg
 	$(BIN)/python -m tests.scenarios.fleet_page
 	$(BIN)/python -m tests.scenarios.bench_page
+	$(BIN)/python -m tests.scenarios.report_pictures
+	$(BIN)/python -m docs.images.inputs
 
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
 once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }

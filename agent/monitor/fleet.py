@@ -54,7 +54,7 @@ IN_TURNS = (
 RUN_SHOWN = 12  # characters of the id of a run
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
-Kind = Literal["drifting", "changed", "held", "doubled", "no data", "silent", "uncalibrated", "sound"]
+Kind = Literal["drifting", "changed", "held", "doubled", "no data", "silent", "retired", "uncalibrated", "sound"]
 
 SHOWN = {"status", "calibration", "good window"}  # a sensor of which none is known, and no drift, has no row
 
@@ -77,11 +77,11 @@ class Fleet:
     sensors and gateways.
     """
 
-    def __init__(self, now_ns: Callable[[], int] = time.time_ns) -> None:
-        """`now_ns`: the present, UTC."""
+    def __init__(self, now_ns: Callable[[], int] = time.time_ns, retired: Collection[str] = ()) -> None:
+        """`now_ns`: the present, UTC; `retired`: gateways (`<site>/<gateway>`) and sensors that were taken down."""
         self.version = now_ns() // 1_000_000  # after those before a restart, which pages that are open know
         self.left_out = 0
-        self._now_ns = now_ns
+        self._now_ns, self._retired = now_ns, frozenset(retired)
         self._heard: dict[Place, _ArrivalTimes] = {}
         self._silent: set[Place] = set()  # that have not been heard for SILENT_INTERVALS
         self._looked_ns = 0
@@ -289,7 +289,8 @@ class Fleet:
             rows = [
                 _gateway_row(place, counts[place], place in self._alive, self._told.get(place),
                              refused.get("/".join(place), 0), self._doubled.get(place, ()),
-                             self._in_turns.get(place, ())) | {"mixed_utc_ns": self._mixed_utc_ns.get(place)}
+                             self._in_turns.get(place, ()), retired="/".join(place) in self._retired)
+                | {"mixed_utc_ns": self._mixed_utc_ns.get(place)}
                 for place in self._gateways | {_place(source) for source in refused}
             ]  # fmt: skip
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
@@ -302,7 +303,9 @@ class Fleet:
             heard = (lost or place not in self._silent) and gateway in self._alive
             doubled = gateway in self._mixed_utc_ns
             of = {"heard_utc_ns": self._heard[place].at_ns, "changed": self._changed[place]}
-            row = _row(place, self._newest[place], self._state_of(gateway), heard=heard, doubled=doubled)
+            retired = not self._retired.isdisjoint(("/".join(gateway), "/".join(place)))
+            state = self._state_of(gateway)
+            row = _row(place, self._newest[place], state, heard=heard, doubled=doubled, retired=retired)
             self._made[place] = row | of
         return self._made[place]
 
@@ -389,15 +392,17 @@ def _verdicts(newest: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     return [f for part, f in newest.items() if part.startswith("drift ") and f["verdict"] != "stable"]
 
 
-def kind_of(verdicts: Collection[str], status: str, *, heard: bool, doubled: bool = False) -> Kind:
+def kind_of(
+    verdicts: Collection[str], status: str, *, heard: bool, doubled: bool = False, retired: bool = False
+) -> Kind:
     """The kind of a sensor: what it counts as on the page. `verdicts`: "drifting" or "stepped"; `doubled`: two gateways
-    have the name of its own, so nobody knows whose results these are.
+    have the name of its own, so nobody knows whose results these are; `retired`: it was taken down.
 
     Held windows are what shows a step, so a sensor that is held and has stepped is held. One whose step was adopted has
     changed: of a drift, too, a part may be told as a step (trends.change_in).
     """
     if not heard:
-        return "silent"
+        return "retired" if retired else "silent"
     if doubled:
         return "doubled"
     if "drifting" in verdicts:
@@ -411,7 +416,13 @@ _OF_STATUS: dict[str, Kind] = {"VALID": "sound", "RECALIBRATING": "sound", "HELD
 
 
 def _row(
-    place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, *, heard: bool, doubled: bool
+    place: Place,
+    newest: dict[str, dict[str, Any]],
+    gateway_state: str,
+    *,
+    heard: bool,
+    doubled: bool,
+    retired: bool,
 ) -> dict[str, Any]:
     status, calibration = newest.get("status", {}), newest.get("calibration", {})
     verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
@@ -421,7 +432,9 @@ def _row(
     why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
     if status.get("status") in NEEDS_A_PERSON:
         why.insert(0, f"{status['status']}: {status['reason']}")
-    if gateway_state == "silent":
+    if retired and not heard:
+        why = ["it was taken down"]
+    elif gateway_state == "silent":
         why.append("the gateway is not on the bus")
     elif not heard:
         why.append(f"no result for {SILENT_INTERVALS} intervals")
@@ -431,7 +444,7 @@ def _row(
         "site": place[0],
         "gateway": place[1],
         "sensor": place[2],
-        "kind": kind_of(told, status.get("status", ""), heard=heard, doubled=doubled),
+        "kind": kind_of(told, status.get("status", ""), heard=heard, doubled=doubled, retired=retired),
         "status": status.get("status", ""),
         "status_utc_ns": status.get("t_utc_ns"),
         "reason": clipped(status.get("reason", "")),
@@ -481,8 +494,10 @@ def _gateway_row(
     refused: int,
     doubled: Sequence[str],
     in_turns: Sequence[str],
+    *,
+    retired: bool,
 ) -> dict[str, Any]:
-    why = [] if alive else ["the gateway is not on the bus"]
+    why = [] if alive or retired else ["the gateway is not on the bus"]
     if doubled:
         why.append(f"{len(doubled)} gateways are on the bus under this name ({_runs(doubled)})")
     elif in_turns:
@@ -495,6 +510,7 @@ def _gateway_row(
         "site": place[0],
         "gateway": place[1],
         "alive": alive,
+        "retired": retired,
         "sensors": sensors,
         "state": clipped(told.state) if told else "",
         "version": clipped(told.version) if told else "",

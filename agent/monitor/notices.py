@@ -63,7 +63,7 @@ class FleetWatch:
                     found.append(Notice("gateway", "/".join(place), "the gateway is on the bus again"))
                 continue
             since_s = self._silent_since.setdefault(place, now_s)
-            told = place in self._told_silent or not row["sensors"]  # a stranger may invent gateways
+            told = place in self._told_silent or row["retired"] or not row["sensors"]  # a stranger may invent gateways
             if now_s - since_s >= self._settings.silent_s and not told:
                 self._told_silent.add(place)
                 words = f"the gateway has not been on the bus for {now_s - since_s:.0f} s"

@@ -74,7 +74,7 @@ def serve(listening: socket.socket, data_dir: Path, bus: BusAccess, web: Web, se
     Raises EndpointError, KeyFileError, UsersError, or sqlite3.Error or DatabaseError where the database cannot
     be used.
     """
-    fleet, stopping = Fleet(), threading.Event()
+    fleet, stopping = Fleet(retired=settings.fleet.retired), threading.Event()
     access, live = Access(web.users), Live(bus.endpoints, bus.tls, stopping)
     forwarding = Forwarding(bus.endpoints, bus.commander, access, fleet)
     with ExitStack() as stack:

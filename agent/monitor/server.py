@@ -49,7 +49,9 @@ _VERSION = re.compile(r"[0-9]{1,18}")
 SEEN_MAX = 50  # sensors of which a page asks at once
 LISTENERS_MAX = 50  # pages that are told of changes at the same time
 TELL_S = 0.5  # s between two looks for a change
-ALIVE_S = 15.0  # s between two comments, which keep proxies from ending the stream, and find clients that are gone
+# s between two events that tell nothing else: they keep proxies from ending the stream, find clients that are gone, and
+# tell a page that its connection still carries something.
+ALIVE_S = 15.0
 
 
 def application(
@@ -212,7 +214,7 @@ class _Data:
                     yield f"event: bench\ndata: {guided}\n\n"
                 if silent_s >= ALIVE_S:
                     silent_s = 0.0
-                    yield ": no change\n\n"
+                    yield "event: alive\ndata: 1\n\n"
                 await asyncio.sleep(TELL_S)
         finally:
             self._listeners.discard(me)

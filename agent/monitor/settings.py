@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field
 from agent.config.files import read_private_file
 from agent.config.reading import ConfigError, load_model
 from agent.config.section import Section
+from agent.delivery.keys import CHUNK
 from agent.monitor.summaries import FULL_DAYS
 
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".webp": "image/webp"}
@@ -95,9 +96,22 @@ class DatabaseSettings(Section):
     ] = FULL_DAYS
 
 
+def _name(text: str) -> str:
+    if len(parts := text.split("/")) not in (2, 3) or not all(map(CHUNK.fullmatch, parts)):
+        raise ValueError("a gateway is SITE/GATEWAY, a sensor SITE/GATEWAY/SENSOR")
+    return text
+
+
+class FleetSettings(Section):
+    """What was taken down: nobody is told that it is silent. It is as any other when it is heard again."""
+
+    retired: Annotated[tuple[Annotated[str, AfterValidator(_name)], ...], Field(max_length=10_000)] = ()
+
+
 class MonitorSettings(Section):
     """The whole file."""
 
+    fleet: FleetSettings = FleetSettings()
     database: DatabaseSettings = DatabaseSettings()
     plan: FloorPlan | None = None
     notices: Notices | None = None
@@ -123,7 +137,7 @@ def load_settings(path: Path) -> MonitorSettings:
             faults.append(f"{path}: notices.email.password_file: {error.filename or ''} {error.strerror or error}")
     if faults:
         raise ConfigError(faults)
-    return MonitorSettings(database=settings.database, plan=plan, notices=notices)
+    return settings.model_copy(update={"plan": plan, "notices": notices})
 
 
 def password_of(email: Email) -> str:

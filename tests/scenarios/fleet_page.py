@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zenoh
@@ -36,6 +36,9 @@ from tests.unit.monitor_site import Served
 from tests.unit.results import calibration
 from tests.unit.zenoh_site import Site, record, wait_for
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 DAY_NS = 86_400_000_000_000
 SEED = 7
 # Sensitivities that fall with frequency, as the field `response` of a calibration.
@@ -49,7 +52,6 @@ VIEWS: dict[str, tuple[dict[str, int], str]] = {
     "fleet": (DESK, "light"), "fleet-dark": (DESK, "dark"), "fleet-tablet": (TABLET, "light"),
     "fleet-phone": (PHONE, "light"), "fleet-readme": ({"width": 1100, "height": 620}, "light"),
 }  # fmt: skip
-WITH_SENSOR = ("fleet", "fleet-dark")  # of which a picture of a sensor is made too
 COLOURS = 128  # of a picture, the most frequent ones, and as many between the others; more make the file larger
 SETTLES_MS = 500  # of drawing
 RATE_HZ = 200.0  # of a corrected stream
@@ -202,7 +204,7 @@ def axe_faults(page: Any) -> list[str]:
 
 
 def write_pictures() -> None:
-    """The page with a fleet of 300 days: the fleet at three widths and dark, a sensor on a desk, light and dark.
+    """The page with a fleet of 300 days: the fleet at three widths and dark, a sensor on a desk.
 
     Without the gateways that send hostile texts, or have copied cards.
     """
@@ -217,28 +219,36 @@ def write_pictures() -> None:
             watched = Watched(browser, shown.served.address, viewport=viewport, color_scheme=scheme)
             page = watched.open()
             page.locator("#cards svg").first.wait_for()
-            _photograph(page, IMAGES / f"{name}.png")
-            if name in WITH_SENSOR:
+            photograph(page, IMAGES / f"{name}.png")
+            if name == "fleet":
                 page.locator("#cards a").first.click()
                 page.locator("#matrix table").first.wait_for()
-                _photograph(page, IMAGES / f"{name.replace('fleet', 'fleet-sensor')}.png")
+                photograph(page, IMAGES / "fleet-sensor.png")
             watched.close()
     site.kill()
 
 
-def _photograph(page: Any, path: Path) -> None:
+def photograph(page: Any, path: Path) -> None:
+    """What the window shows, as a small file."""
     from PIL import Image
 
     page.wait_for_timeout(SETTLES_MS)
     page.screenshot(path=path)
     with Image.open(path) as opened:
         picture = opened.convert("RGB")
+    with_few_colours(picture).save(path, optimize=True)
+
+
+def with_few_colours(picture: Image.Image) -> Image.Image:
+    """The picture with its COLOURS most frequent colours, and as many between the others."""
+    from PIL import Image
+
     counts = sorted(picture.getcolors(picture.width * picture.height) or (), reverse=True)
     frequent = [part for _, colour in counts[:COLOURS] for part in colour]  # type: ignore[union-attr]
     between = picture.quantize(COLOURS, dither=Image.Dither.NONE).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*frequent, *between[: 3 * COLOURS]])
-    picture.quantize(palette=palette, dither=Image.Dither.NONE).save(path, optimize=True)
+    return picture.quantize(palette=palette, dither=Image.Dither.NONE)
 
 
 def look_at_views(directory: Path) -> int:

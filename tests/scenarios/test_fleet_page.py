@@ -265,6 +265,7 @@ def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history
         page.get_by_role("button", name="1 not heard").wait_for()
         page.locator("#new-cards", has_text="1 new").click()
         page.locator("#cards", has_text="Not heard since").wait_for()
+        assert page.locator("#gateways td").all_inner_texts()[:3] == ["simulated/gw0000", "no", ""]  # its state is old
         assert time.monotonic() - begun < SILENT_S
         history = monitor.get(asked)
         monitor.stop()

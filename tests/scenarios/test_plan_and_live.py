@@ -118,6 +118,7 @@ def test_the_signal_is_shown_with_its_spectrum_and_ends_when_nobody_looks(
             page.get_by_label("Spectrum in").select_option("amplitude")
             page.get_by_text("Power spectral density, (m/s²)/√Hz").wait_for()
             assert axe_faults(page) == []
+            page.get_by_text("What is shown is of then.").wait_for()  # the gateway sends nothing more
             assert served.live.streams == 1
             page.get_by_role("button", name="Stop").click()
             wait_for(lambda: served.live.streams == 0)

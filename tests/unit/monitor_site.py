@@ -148,6 +148,10 @@ class Monitor:
         rows: list[dict[str, Any]] = self.get("api/fleet")["sensors"]
         return rows
 
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to the process."""
+        self._process.send_signal(number)
+
     def kill(self) -> None:
         """Kill -9."""
         self._process.kill()

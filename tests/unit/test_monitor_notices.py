@@ -98,6 +98,20 @@ def test_a_silent_gateway_is_told_once_and_again_when_it_is_back() -> None:
     assert [n.text for n in watch.update(5001.0, NOW)] == ["the gateway is on the bus again"]
 
 
+def test_nobody_is_told_of_what_was_taken_down(tmp_path: Path) -> None:
+    path = tmp_path / "monitor.toml"
+    path.write_text('[fleet]\nretired = ["site/gw", "site/other/mems"]\n')
+    fleet = Fleet(retired=load_settings(path).fleet.retired)
+    watch = FleetWatch(fleet, Notices(silent_s=600), [])
+    for gateway in ("gw", "other"):
+        fleet.take("site", gateway, "mems", "status", held(), fresh=False)
+    told = [watch.update(t, NOW) for t in (0.0, 700.0)]
+    assert [[n.subject for n in each] for each in told] == [[], ["site/other"]]
+    path.write_text('[fleet]\nretired = ["site", "a/b/c/d"]\n')
+    with pytest.raises(ConfigError, match=r"retired.*a gateway is SITE/GATEWAY"):
+        load_settings(path)
+
+
 def test_a_certificate_that_ends_is_told_each_week(tmp_path: Path) -> None:
     path = tmp_path / "fleet.pem"
     path.write_bytes(make_authority("fleet", 40, NOW).certificate_pem)

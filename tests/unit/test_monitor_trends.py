@@ -356,3 +356,18 @@ def test_a_witness_is_heard_in_the_name_of_one_gateway_and_was_compared_since_th
     assert fleet.beside(own, since_utc_ns) == {"count": 3, "changed": 2}  # steady, held, drifts
     assert fleet.beside(own, NOW_NS - 7 * DAY_NS) == {"count": 4, "changed": 2}  # early too
     assert fleet.beside(own, NOW_NS) == {"count": 0, "changed": 0}
+
+
+def test_what_was_taken_down_is_not_silent_and_as_any_other_when_it_is_heard_again() -> None:
+    fleet = Fleet(Clock(), retired=["site/old", "site/gw/mems"])
+    places = [PLACE, ("site", "gw", "other"), ("site", "old", "mems")]
+    for number, place in enumerate(places, start=1):
+        fleet.take(*place, "calibration", fields_of(calibration(number)))
+        fleet.take(*place, "status", fields_of(status(number)))
+    assert [row["kind"] for row in fleet.rows()] == ["retired", "silent", "retired"]
+    assert [(row["gateway"], row["why"], row["retired"]) for row in fleet.gateways({})] == [
+        ("gw", "the gateway is not on the bus", False), ("old", "", True),
+    ]  # fmt: skip
+    for gateway in ("gw", "old"):
+        fleet.set_alive("site", gateway, True)
+    assert [row["kind"] for row in fleet.rows()] == ["sound", "sound", "sound"]

@@ -20,10 +20,15 @@ export const view = () => new URLSearchParams(location.hash.slice(1));
 export const full = (row) => `${row.site}/${row.gateway}/${row.sensor}`;
 export const placeOf = (row) => new URLSearchParams({ site: row.site, gateway: row.gateway, sensor: row.sensor });
 
+// Nothing comes from it.
+export const isUnheard = (row) => row.kind === "silent" || row.kind === "retired";
+
 export class NeedsLogin extends Error {}
 
+const ANSWERS_MS = 60000; // a monitor that hangs must not leave old values unmarked
+
 export async function get(path) {
-  const answer = await fetch(path);
+  const answer = await fetch(path, { signal: AbortSignal.timeout(ANSWERS_MS) });
   if (answer.status === 401) throw new NeedsLogin();
   if (!answer.ok) throw new Error(await answer.text());
   return answer.json();

@@ -30,7 +30,7 @@ function wanted(row, filter) {
 
 function showCounts(sensors, kind, go) {
   const count = (one) => sensors.filter((row) => row.kind === one).length;
-  const kinds = ["sound", "drifting", "held", "silent", ...["changed", "doubled", "no data", "uncalibrated"].filter(count)];
+  const kinds = ["sound", "drifting", "held", "silent", ...["changed", "doubled", "no data", "uncalibrated", "retired"].filter(count)];
   const key = JSON.stringify([kinds.map(count), sensors.length, kind]);
   if ($("counts").dataset.key === key) return;
   const focused = [...$("counts").children].indexOf(document.activeElement);
@@ -238,7 +238,7 @@ function showTable(sensors, gateways, filter) {
     if (many) size(group);
     put(group.button.children[0], `${rows[0].site} / ${rows[0].gateway}`);
     const state = states.get(name);
-    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? stateOf(state) : "not on the bus"}`);
+    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? stateOf(state) : state?.retired ? "retired" : "not on the bus"}`);
     if (group.built || group.seen) fill(group);
   }
   $("sensors").setAttribute("aria-rowcount", String(sensors.length));
@@ -272,7 +272,7 @@ export function show(told, go) {
   if (waits(told.sensors, told.gateways, filter)) return;
   showCards(told.sensors, told.gateways, filter);
   showTable(told.sensors, told.gateways, filter);
-  const rows = told.gateways.slice(0, GATEWAYS_MAX).map((g) => [gatewayOf(g), g.alive ? "yes" : "no", g.state, g.sensors, g.version, make("span", g.why, { class: "why" })]), key = JSON.stringify(told.gateways);
+  const rows = told.gateways.slice(0, GATEWAYS_MAX).map((g) => [gatewayOf(g), g.alive ? "yes" : "no", g.alive ? g.state : g.retired ? "retired" : "", g.sensors, g.version, make("span", g.why, { class: "why" })]), key = JSON.stringify(told.gateways);
   if ($("gateways").dataset.key !== key && !inHand($("gateways"))) {
     $("gateways").dataset.key = key;
     $("gateways").replaceChildren(table("Gateways", ["Gateway", "On the bus", "State", "Sensors", "Version", "Why a person is needed"], rows));
@@ -294,6 +294,7 @@ export function start() {
   $("fleet-png").addEventListener("click", picture);
   $("more-cards").addEventListener("click", () => { shownCards += 20; show(latest, changing); });
   document.addEventListener("visibilitychange", leave);
+  addEventListener("beforeprint", () => { for (const group of groups.values()) { group.seen = true; fill(group); } });
   $("new-cards").addEventListener("click", () => { order = null; show(latest, changing); });
   for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchmove"]) addEventListener(name, () => { touchedAt = performance.now(); }, { passive: true });
   $("fold").addEventListener("click", () => {

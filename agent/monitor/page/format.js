@@ -41,11 +41,14 @@ export const ago = (ns, at = now()) => (ns ? duration(at - ns) : "never");
 const held = (ns) => finite(ns) && Math.abs(ns) < 8e21;
 export const utc = (ns) => (held(ns) ? new Date(ns / 1e6).toISOString().slice(0, 19).replace("T", " ") : "no time");
 
+// The words of the page are English, so the dates are too; the zone is the reader's.
+const LOCALE = "en-US", CLOCK = { hour: "2-digit", minute: "2-digit", hourCycle: "h23" };
+export const clockTime = () => new Date().toLocaleTimeString(LOCALE, { ...CLOCK, second: "2-digit" });
 const thisYear = (date) => date.getFullYear() === new Date().getFullYear();
 function words(ns, clock) {
   if (!held(ns)) return "no time";
   const date = new Date(ns / 1e6), year = thisYear(date) ? {} : { year: "numeric" };
-  return date.toLocaleString(undefined, { day: "numeric", month: "short", ...year, ...(clock ? { hour: "2-digit", minute: "2-digit" } : {}) });
+  return date.toLocaleString(LOCALE, { day: "numeric", month: "short", ...year, ...(clock ? CLOCK : {}) });
 }
 
 // A time in the reader's zone, with UTC on hover.

@@ -1,13 +1,14 @@
 // The live view of one sensor: the newest block of its corrected stream, its last minute and its spectrum. The monitor
 // listens to the sensor as long as the view is open and seen, and for a quarter of an hour at most.
 import { $, make, text, view } from "./common.js";
-import { AXES } from "./format.js";
+import { AXES, duration } from "./format.js";
 import { colours } from "./plots.js";
 
 const UNITS = { density: ["(m/s²)²/Hz", (v) => v], amplitude: ["(m/s²)/√Hz", Math.sqrt] };
 const few = (value) => Number(value.toPrecision(3)).toString();
 
-let source = null, of = "", minute = null;
+const LATE_MS = 5000; // a gateway sends two blocks a second
+let source = null, of = "", minute = null, blockAt = 0;
 const plots = new Map();
 
 const say = (words) => $("live-told").replaceChildren(text(words));
@@ -24,7 +25,8 @@ function begin() {
   $("live-name").replaceChildren(make("a", `${place.get("site")}/${place.get("gateway")}/${place.get("sensor")}`, { href: `#${place}` }));
   say("Waiting for a block. The gateway sends none unless its channel has acceleration = \"publish\" or \"record\".");
   source = new EventSource(`api/live?minute=1&${place}`);
-  source.onmessage = (message) => drawBlock(JSON.parse(message.data));
+  blockAt = 0;
+  source.onmessage = (message) => { blockAt = performance.now(); drawBlock(JSON.parse(message.data)); };
   source.addEventListener("minute", (message) => { minute = JSON.parse(message.data); drawMinute(); });
   source.addEventListener("end", () => ended("Ended after a quarter of an hour."));
   source.onerror = () => { if (source?.readyState === EventSource.CLOSED) ended("The monitor gives no stream now: too many people look at signals, or you must log in."); };
@@ -35,6 +37,12 @@ function stop() {
   source?.close();
   source = null;
   $("live-go").textContent = "Show the signal";
+}
+
+// What is shown is old then, and said to be so.
+function listen() {
+  const since_ms = performance.now() - blockAt;
+  if (source && blockAt && since_ms > LATE_MS) say(`No block for ${duration(since_ms * 1e6)}. What is shown is of then.`);
 }
 
 function ended(words) {
@@ -106,6 +114,7 @@ export function start() {
     make("div", [], { id: "live-spectrum", class: "plot", role: "group", "aria-label": "Spectrum" }),
     make("p", [], { id: "live-spectrum-told", class: "hint" }),
   );
+  setInterval(listen, 1000);
   document.addEventListener("visibilitychange", () => { if (document.hidden && source) ended("Stopped, because nobody looked."); });
 }
 

@@ -4,8 +4,9 @@ import { $, full, get, make, NeedsLogin, text, view } from "./common.js";
 import { setUser } from "./commands.js";
 import * as events from "./events.js";
 import * as fleet from "./fleet.js";
-import { duration, setNow } from "./format.js";
+import { clockTime, duration, setNow } from "./format.js";
 import * as live from "./live.js";
+import { chip, KINDS } from "./parts.js";
 import * as plan from "./plan.js";
 import * as sensor from "./sensor.js";
 
@@ -16,7 +17,8 @@ import * as sensor from "./sensor.js";
 // changes the parameters of the address.
 const VIEWS = { fleet, sensor, plan, live, bench, events };
 const OLD_S = 120; // from which the age of the last result is told
-let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, following = false, loading = false, again = false, lost = "";
+const HEARD_MS = 40000; // the monitor says something each 15 s
+let told = null, me = { needs_login: false, user: "", verbs: [], token: "" }, changes = null, following = false, loading = false, again = false, lost = "", heardAt = 0;
 
 function go(given) {
   const next = view();
@@ -47,7 +49,7 @@ async function show() {
 }
 
 function summary() {
-  const bus = told.bus, need = told.sensors.filter((row) => row.kind !== "sound").length;
+  const bus = told.bus, need = told.sensors.filter((row) => row.kind !== "sound" && row.kind !== "retired").length;
   return [
     `Sensors: ${told.sensors.length}`, need ? `${need} not in order` : "all in order", bus.verifies ? "signatures verified" : "signatures not verified (option --keys)",
     bus.unconfirmed ? `${bus.unconfirmed} unconfirmed results` : "", bus.left_out ? `${bus.left_out} results beyond the limits are not shown` : "",
@@ -64,7 +66,7 @@ function failed(error) {
 
 // What is shown then is old, and looks so.
 function silent() {
-  lost ||= new Date().toLocaleTimeString();
+  lost ||= clockTime();
   say(`the monitor does not answer since ${lost}${told ? "; what is shown is of then" : ""}`);
   document.querySelector("main").classList.toggle("old", Boolean(told));
 }
@@ -98,14 +100,30 @@ async function load() {
 
 const showOpenBench = () => { if (told && !$("bench").hidden) bench.show().catch(failed); };
 
+const hearing = (then) => () => { heardAt = performance.now(); then(); };
+
 // A browser opens six connections to one server for all its pages together. So a page that nobody sees gives its own back.
 function follow() {
   changes?.close();
   if (document.hidden || !following) return;
+  heardAt = performance.now();
   changes = new EventSource("api/changes");
-  changes.onmessage = load;
-  changes.addEventListener("bench", showOpenBench);
-  changes.onerror = () => { silent(); changes.close(); setTimeout(begin, 2000); };
+  changes.onmessage = hearing(load);
+  changes.addEventListener("bench", hearing(showOpenBench));
+  changes.addEventListener("alive", hearing(() => lost && load()));
+  changes.onerror = beginAnew;
+}
+
+function beginAnew() {
+  silent();
+  following = false;
+  changes.close();
+  setTimeout(begin, 2000);
+}
+
+// A connection may end without a word: the computer sleeps, a router forgets it, the monitor hangs.
+function listen() {
+  if (following && !document.hidden && performance.now() - heardAt > HEARD_MS) beginAnew();
 }
 
 function logIn() {
@@ -149,11 +167,20 @@ $("login").addEventListener("submit", async (event) => {
   $("login-told").replaceChildren(text(answer.ok ? "" : await answer.text()));
   if (answer.ok) await begin();
 });
-addEventListener("hashchange", show);
+// A view that a person opens by a link begins at its top; the browser keeps the place of one to which a person goes back.
+let opened = "";
+addEventListener("click", (event) => { opened = event.target.closest?.("a")?.hash ?? ""; });
+addEventListener("hashchange", () => {
+  if (opened && opened === location.hash) scrollTo(0, 0);
+  opened = "";
+  show();
+});
 document.addEventListener("visibilitychange", follow);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { sensor.leave(); bench.leave(); show(); });
 for (const one of Object.values(VIEWS)) one.start?.(go);
+$("meanings").append(...Object.entries(KINDS).flatMap(([kind, [, , meaning]]) => [make("dt", chip(kind)), make("dd", meaning)]));
 $("zone").textContent = Intl.DateTimeFormat().resolvedOptions().timeZone;
 setInterval(() => { if (told && !$("fleet").hidden) fleet.show(told, go); }, 30000); // ages grow without a change
+setInterval(listen, 5000);
 setInterval(showOpenBench, 5000); // so does the silence of a bench
 begin();

@@ -21,12 +21,13 @@ const INVENTED = [
   [row("deck-07", { kind: "drifting", verdicts: [verdict("Sxx", "drifting", 12, 300, 2)] }), history([drift, calm, calm], { found: found(drift, "Sxx", t, 0.5, bent(2.4, 0.5)) })],
   [row("deck-08", { kind: "drifting", u_pct: 3.7, u_axis: "Syy", verdicts: [verdict("Sxx", "drifting", 12, 300, 2)] }), history([drift, calm, calm], { found: found(drift, "Sxx", t, 3.7, bent(2.4, 3.7)) })],
   [row("deck-04", { kind: "changed", u_pct: 3.4, verdicts: [verdict("Szz", "stepped", 40, -806, null)] }), history([calm, calm, step], { adopted_utc_ns: t[51], found: found(step, "Szz", t, 3.4, null, [t[39], t[40]]) })],
-  [{ ...held, verdicts: [verdict("Syy", "stepped", 49, -2340, null)] }, history([calm, calm, calm], { refused_utc_ns: t.slice(49), estimates, found: found(calm, "Syy", long, 0.4, null, [t[47], t[49]]) })],
+  [{ ...held, verdicts: [verdict("Syy", "stepped", 49, -2340, null), verdict("Qy", "stepped", 49, 23400, null)] }, history([calm, calm, calm], { refused_utc_ns: t.slice(49), estimates, found: { ...found(calm, "Syy", long, 0.4, null, [t[47], t[49]]), ...found(calm, "Qy", long, 0.4, null, [t[47], t[49]]) } })],
   [held, history([calm, calm, calm].map((v) => v.slice(0, 48)), { t_utc_ns: long, refused_utc_ns: t.slice(49), estimates: [] })],
   [{ ...held, reason: "put on hold by anna" }, history([calm, calm, calm].map((v) => v.slice(0, 48)), { t_utc_ns: long, refused_utc_ns: [], estimates: [] })],
   [row("tower-1", { kind: "doubled" }), {}],
   [row("deck-05", { kind: "no data", status: "INVALID", status_utc_ns: t[50], reason: "deck-05 is lost: [Errno 121] Remote I/O error", last_good_utc_ns: t[47] }), history([calm, calm, calm].map((v) => v.slice(0, 48)), { t_utc_ns: long, held_utc_ns: t[50] })],
   [row("tower-4", { kind: "silent", gateway_state: "silent", last_good_utc_ns: t[50], result_utc_ns: t[50], heard_utc_ns: t[52] }), {}],
+  [row("tower-2", { kind: "retired", gateway_state: "silent", last_good_utc_ns: t[50], result_utc_ns: t[50], heard_utc_ns: t[50] }), {}],
   [row("deck-09", { kind: "uncalibrated", status: "COLLECTING", reason: "Sxz, Syz are not determined", calibration_utc_ns: null, last_good_utc_ns: null }), {}],
 ];
 const sound = [row("deck-01", {}), history([calm, calm, drift], {})];

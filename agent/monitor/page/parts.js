@@ -4,16 +4,17 @@ import { finite } from "./format.js";
 
 // What a sensor counts as (agent.monitor.fleet): its words, its colour, and what they mean. The last two are of cards.
 export const KINDS = {
-  sound: ["in order", "ok", "windows fit the calibration in force, and no drift is found"],
-  drifting: ["drifting", "bad", "S or Q changes slowly; the calibration follows, and U covers it"],
-  changed: ["changed", "bad", "S or Q has changed at once, and the change was adopted"],
-  held: ["held", "warn", "new windows contradict the calibration in force, or an operator put it on hold"],
-  silent: ["not heard", "off", "the gateway has left the bus, or three intervals have no result"],
-  "no data": ["no data", "bad", "the gateway gets no samples of the sensor"],
-  uncalibrated: ["not calibrated", "off", "no calibration is in force yet"],
-  doubled: ["two of one name", "bad", "two gateways have one name, so nobody knows whose results these are"],
-  gateway: ["gateway", "warn", "the gateway itself needs a person"],
-  over: ["over", "off", "this no longer needs a person"],
+  sound: ["in order", "ok", "Windows fit S and Q in force, and no drift and no step is found."],
+  drifting: ["drifting", "bad", "The agent's test has found a slow change of S or Q. Whether S and Q in force follow it stands beside “values”."],
+  changed: ["changed", "bad", "S or Q has changed at once, and S and Q in force follow: the change was adopted."],
+  held: ["held", "warn", "New windows contradict S and Q in force, which stay: a person must look. Or an operator put it on hold."],
+  silent: ["not heard", "off", "The gateway has left the bus, or three intervals passed without a result. What was taken down can be named in the configuration of the monitor."],
+  retired: ["retired", "off", "It was taken down, says the configuration of the monitor. When it is heard again it is as any other."],
+  "no data": ["no data", "bad", "The gateway gets no samples of the sensor."],
+  uncalibrated: ["not calibrated", "off", "No calibration is in force yet."],
+  doubled: ["two of one name", "bad", "Two gateways, as of a copied memory card, give results under one name, so nobody knows whose they are. A run is a gateway from its start to its end."],
+  gateway: ["gateway", "warn", "The gateway itself needs a person."],
+  over: ["over", "off", "This no longer needs a person."],
 };
 export const chip = (kind) => make("span", KINDS[kind][0], { class: `chip ${KINDS[kind][1]}`, title: KINDS[kind][2] });
 

@@ -84,13 +84,38 @@ function point(row, label) {
     points.set(name, made);
   }
   const made = points.get(name), [x, y] = plan.positions[name];
-  made.className = `point ${tone}${x > 0.8 ? " left" : ""}`; // the name is where the picture has room for it
+  made.className = `point ${tone}`;
   made.firstChild.textContent = clean(label);
   made.title = words;
   made.setAttribute("aria-label", words);
   made.style.left = `${100 * x}%`;
   made.style.top = `${100 * y}%`;
   return made;
+}
+
+const SIDES = ["right", "left", "above", "below"];
+const RADIUS_PX = 11, APART_PX = 2; // of a point; between names
+const TONES = ["bad", "warn", "off"]; // whose names are shown, the first ones first
+
+function boxBeside([x, y], [width, height], side) {
+  const left = { right: x + RADIUS_PX, left: x - RADIUS_PX - width }[side] ?? x - width / 2, top = { above: y - RADIUS_PX - height, below: y + RADIUS_PX }[side] ?? y - height / 2;
+  return [left, top, left + width, top + height];
+}
+
+// Each name stands on the first side of its point where it covers no point, no name and no edge. Where there is no such side
+// it is shown when a person points at its point.
+function arrangeNames() {
+  const picture = $("plan-picture"), width = picture.clientWidth, height = picture.clientHeight, rank = (one) => TONES.indexOf(one.classList[1]);
+  const all = [...points].filter(([, one]) => one.isConnected).map(([name, one]) => ({ one, at: [plan.positions[name][0] * width, plan.positions[name][1] * height] }));
+  for (const { one, at: [x] } of all) { one.dataset.side = x > width / 2 ? "left" : "right"; one.classList.remove("quiet"); }
+  const named = all.filter(({ one }) => rank(one) >= 0).sort((a, b) => rank(a.one) - rank(b.one)).map((each) => ({ ...each, size: [each.one.firstChild.offsetWidth, each.one.firstChild.offsetHeight] }));
+  const taken = all.map(({ at: [x, y] }) => [x - RADIUS_PX, y - RADIUS_PX, x + RADIUS_PX, y + RADIUS_PX]);
+  const free = ([left, top, right, bottom]) => left >= 0 && top >= 0 && right <= width && bottom <= height && taken.every((other) => right <= other[0] || left >= other[2] || bottom <= other[1] || top >= other[3]);
+  for (const { one, at, size } of named) {
+    const side = SIDES.find((each) => free(boxBeside(at, size, each))), [left, top, right, bottom] = boxBeside(at, size, side);
+    one.classList.toggle("quiet", !side);
+    if (side) { one.dataset.side = side; taken.push([left - APART_PX, top - APART_PX, right + APART_PX, bottom + APART_PX]); }
+  }
 }
 
 function draw() {
@@ -105,6 +130,7 @@ function draw() {
   const shown = placed.map((row) => point(row, alone(row) ? row.sensor : `${row.gateway} / ${row.sensor}`)), there = [...$("plan-picture").querySelectorAll(".point")];
   for (const old of there) if (!shown.includes(old)) old.remove();
   $("plan-picture").append(...shown.filter((one) => !there.includes(one)));
+  arrangeNames();
   const kinds = Object.keys(KINDS).filter((kind) => placed.some((row) => row.kind === kind));
   $("plan-legend").replaceChildren(...kinds.map((kind) => make("span", [make("i", [], { class: `point ${KINDS[kind][1]}`, "aria-hidden": "true" }), `${placed.filter((row) => row.kind === kind).length} ${KINDS[kind][0]}`])), make("span", `${rows.length - placed.length} not on the plan`));
   const names = rows.map(full).sort((a, b) => Boolean(plan.positions[a]) - Boolean(plan.positions[b]) || a.localeCompare(b)), key = JSON.stringify(names);
@@ -141,6 +167,7 @@ export function start() {
     make("p", "There is no plan yet. A user with the right “plan” puts a picture of the structure here; docs/fleet.md says how.", { id: "plan-empty", hidden: true }),
     make("div", [], { id: "plan-picture", hidden: true, click: (event) => arranging && chosen && event.target.tagName === "IMG" && put(chosen, place(event)) }),
   );
+  new ResizeObserver(arrangeNames).observe($("plan-picture"));
 }
 
 export async function show(told) {

@@ -1,6 +1,6 @@
 // Plots by uPlot: quantities over time with bands of k = 2, all with the same range of time; and the response.
 import { make } from "./common.js";
-import { finite, signed } from "./format.js";
+import { day, finite, signed } from "./format.js";
 
 // What is in force stays so until the next calibration.
 const stays = uPlot.paths.stepped({ align: 1 });
@@ -10,6 +10,9 @@ const WORDS_ROWS = 3, WORDS_PX = 14; // rows of words above a plot with marks
 // A named value of page.css.
 export const named = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 export const colours = () => ["--x", "--y", "--z"].map(named);
+// Dates that are read alike everywhere, for steps of a year, of months, days, hours and minutes, and of seconds.
+const DATES = [[31536000, "{YYYY}", null], [2419200, "{MMM}", "\n{YYYY}"], [86400, "{MMM} {D}", "\n{YYYY}"], [60, "{HH}:{mm}", "\n{MMM} {D} {YYYY}", null, "\n{MMM} {D}"], [1, ":{ss}", "\n{MMM} {D} {YYYY} {HH}:{mm}", null, "\n{MMM} {D} {HH}:{mm}", null, "\n{HH}:{mm}"]].map((given) => [...given, ...Array(8 - given.length).fill(null), 1]);
+const MOMENT = "{MMM} {D} {YYYY} {HH}:{mm}";
 const axisOf = () => ({ stroke: named("--mute"), grid: { stroke: named("--line"), width: 1 }, ticks: { stroke: named("--line"), width: 1 }, font: "12px system-ui, sans-serif" });
 const width = (box) => box.clientWidth || 320;
 
@@ -37,7 +40,7 @@ export class TimePlots {
   }
 
   made(one, times, box) {
-    const axis = axisOf(), series = [{}], data = [times], bands = [];
+    const axis = axisOf(), series = [{ value: MOMENT }], data = [times], bands = [];
     for (const { label, values, u, tone, dashed } of one.series) {
       const colour = named(`--${tone}`), at = series.length;
       const paths = dashed ? undefined : stays;
@@ -50,12 +53,13 @@ export class TimePlots {
       }
       bands.push({ series: [at + 1, at + 2], fill: `${colour}1c` });
     }
-    box.setAttribute("aria-label", `${one.title} over time`);
+    const marks = (one.marks ?? []).map(({ t, text }) => `${day(1e9 * t).textContent}: ${text}`); // a canvas tells nothing by itself
+    box.setAttribute("aria-label", [`${one.title} over time`, ...marks].join("; "));
     box.replaceChildren();
     const above = one.marks?.length ? WORDS_ROWS * WORDS_PX : 0;
     const plot = new uPlot({
       width: width(box), height: one.height, cursor: { sync: { key: "time" }, y: false }, legend: { live: true },
-      axes: [axis, { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => `${signed(v, 10 * (ticks[1] - ticks[0] || 1))}${one.unit}`) }],
+      axes: [{ ...axis, values: DATES }, { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => `${signed(v, 10 * (ticks[1] - ticks[0] || 1))}${one.unit}`) }],
       series, bands, padding: [12 + above, 12, null, null],
       scales: { y: { range: (_, low, high) => rangeOf(one, low, high) } },
       hooks: { draw: [(made) => drawMarks(made, one.marks ?? []), (made) => drawRefused(made, one.refused ?? [])], setScale: [(made, key) => key === "x" && this.zoomed(made)] },
@@ -159,7 +163,7 @@ function drawRefused(plot, times) {
 
 // Curves {label, values, u} over one axis of x; `log`: a logarithmic axis of frequency; `time`: x is s of UTC.
 export function curves(box, title, x, series, log, time = false, height = 240) {
-  const axis = axisOf(), COLOURS = colours(), drawn = [time ? {} : { label: "Hz" }], data = [x], bands = [];
+  const axis = axisOf(), COLOURS = colours(), drawn = [time ? { value: MOMENT } : { label: "Hz" }], data = [x], bands = [];
   series.forEach((one, i) => {
     drawn.push({ label: one.label, stroke: COLOURS[i], width: one.u ? 2 : 1, points: { show: x.length < 60 } });
     data.push(one.values);
@@ -171,7 +175,7 @@ export function curves(box, title, x, series, log, time = false, height = 240) {
     bands.push({ series: [drawn.length - 2, drawn.length - 1], fill: `${COLOURS[i]}22` });
   });
   box.replaceChildren();
-  const plot = new uPlot({ title, width: width(box), height, axes: [axis, { ...axis, size: 70 }], scales: { x: { time, distr: log ? 3 : 1 } }, series: drawn, bands, cursor: { drag: { setScale: !log } } }, data, box);
+  const plot = new uPlot({ title, width: width(box), height, axes: [time ? { ...axis, values: DATES } : axis, { ...axis, size: 70 }], scales: { x: { time, distr: log ? 3 : 1 } }, series: drawn, bands, cursor: { drag: { setScale: !log } } }, data, box);
   [...box.querySelectorAll(".u-series")].forEach((label, i) => { label.hidden = Boolean(drawn[i].edge); });
   return plot;
 }

@@ -1,5 +1,5 @@
 // The view of one sensor: what is said of it, S and Q over time, response, what makes U, events, history, commands.
-import { $, clean, full, get, make, placeOf, table, text, view } from "./common.js";
+import { $, clean, full, get, isUnheard, make, placeOf, table, text, view } from "./common.js";
 import { opener, poseForm } from "./commands.js";
 import { drawRows } from "./diagram.js";
 import { ago, AXES, band, day, finite, MAIN, moment, NAMES, plusMinus, rounded, short, symbol, two } from "./format.js";
@@ -11,6 +11,7 @@ import { cause, certificate, covered, explanation, shortName, steps, timeOf, tol
 const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
 const KINDS = ["calibration", "window", "drift", "status", "estimate", "clock"];
 const MARKS_MAX = 40;
+const NOTHING = { sound: "Nothing: it is in order.", retired: "Nothing: it was taken down." };
 const BUDGET_LEAST = 0.01; // share of a source that is shown by itself
 const value = (c, i) => (i < 9 ? c.sensitivity[Math.floor(i / 3)][i % 3] : c.offset[i - 9]);
 const ofAxis = (c, i) => value(c, i < 9 ? 4 * Math.floor(i / 3) : 4 * (i - 9)); // the main sensitivity of an output
@@ -60,7 +61,7 @@ function going({ values, u, ...rest }, more, stays) {
 
 function drawPlots(mine, row, trends, whole, found) {
   const from = whole.find((c) => c.t_utc_ns >= (trends.accepted_utc_ns ?? 0)) ?? whole[0], all = NAMES.map((_, i) => i);
-  const beyond = beyondOf(row, whole, found.estimate), stays = row && !["silent", "no data"].includes(row.kind), today = row && row.kind !== "silent" ? [timeOf(row)] : [];
+  const beyond = beyondOf(row, whole, found.estimate), stays = row && !isUnheard(row) && row.kind !== "no data", today = row && !isUnheard(row) ? [timeOf(row)] : [];
   const times = [...whole, ...beyond].map((c) => c.t_utc_ns / 1e9).concat(whole.length ? today.map((ns) => ns / 1e9) : []), more = times.length - whole.length;
   const held = row?.status === "HELD" ? trends.held_utc_ns : null, refused = held ? found.window.filter((w) => !w.used && w.t_utc_ns >= held).map((w) => w.t_utc_ns / 1e9) : [];
   const marks = [...marksOf(row, trends, whole, found.status), ...(held ? [{ t: held / 1e9, text: "held", alarm: true }] : [])];
@@ -106,10 +107,9 @@ function showMatrix(newest, row, trends) {
   };
   const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
   const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);
-  const Q = AXES.map((axis, i) => make("td", [rounded(newest.offset[i], 2 * newest.standard_uncertainty[9 + i]), make("small", `± ${two(2 * newest.standard_uncertainty[9 + i])}`)], { title: `Q${axis}`, class: moved.has(`Q${axis}`) ? "moved" : "" }));
   const at = [`At ${two(newest.reference_frequency_hz)} Hz`, newest.valid_band_hz?.length === 2 ? `; right within U/3 from ${band(newest.valid_band_hz)}` : "", ". U with k = 2 below each value; “moved”: its change since the accepted calibration over U of that change."];
   $("matrix").replaceChildren(make("table", [make("caption", "S in force", { class: "hidden" }), make("thead", head), make("tbody", rows)], { class: "matrix" }),
-    make("table", [make("caption", `Offset Q, ${clean(newest.output_unit)}`), make("tbody", make("tr", Q))], { class: "matrix" }), make("p", at, { class: "hint" }));
+    make("table", [make("caption", `Offset Q, ${clean(newest.output_unit)}`), make("tbody", make("tr", AXES.map((_, i) => cell(9 + i))))], { class: "matrix" }), make("p", at, { class: "hint" }));
 }
 
 function showBudget(newest, row, trends) {
@@ -237,7 +237,7 @@ function showHead(row, place, trends) {
   $("state").replaceChildren(make("span", say));
   $("usable").replaceChildren(...(row ? [may(covered(row, trends))] : []));
   $("beside-state").replaceChildren(make("span", more));
-  $("sensor-steps").replaceChildren(make("h3", "What to do:"), ...(row ? steps(row, trends) : []), ...(!row || row.kind === "sound" ? [make("p", row ? "Nothing: it is in order." : "Look at the names in the address.")] : []));
+  $("sensor-steps").replaceChildren(make("h3", "What to do:"), ...(row ? steps(row, trends) : []), ...(!row || NOTHING[row.kind] ? [make("p", row ? NOTHING[row.kind] : "Look at the names in the address.")] : []));
 }
 
 // The folded parts that a person has opened stay open.

@@ -1,6 +1,6 @@
 // What is said of a sensor: its verdicts in sentences, what else is steady, and what a person can do.
 import { commandLine } from "./commands.js";
-import { clean, make } from "./common.js";
+import { clean, isUnheard, make } from "./common.js";
 import { ago, AXES, band, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
 import { copier, spark } from "./parts.js";
 
@@ -15,30 +15,51 @@ function scaled(parameter, scale) {
   return { unit: !known ? "" : offset ? " m/s²" : " %", factor: !known ? 1 : (offset ? 1 : 100) / Math.abs(scale) };
 }
 
-const named = (parameter) => [parameter[0] === "Q" ? "Offset " : "Sensitivity ", symbol(parameter)];
-const pair = (v, U, unit) => [make("b", `${rounded(Math.abs(v), U)}${unit}`), finite(U) ? ` (± ${two(U)}${unit})` : ""];
+const named = (parameter) => [parameter[0] === "Q" ? "offset " : "sensitivity ", symbol(parameter)];
 const spread = (days) => (finite(days) ? ` (± ${duration(2 * days * DAY_NS)})` : "");
+
+// A size with its U. Where U is larger, the change is found all the same (by the verdict), so it has this direction.
+function pair(v, U, unit) {
+  const size = Math.abs(v), range = U > size ? `0 to ${rounded(size + U, U)}` : `± ${two(U)}`;
+  return [make("b", `${rounded(size, U)}${unit}`), finite(U) ? ` (${range}${unit})` : ""];
+}
 
 // Between which times a change began (agent.monitor.trends): values are uncertain from the first one on.
 const beganOf = (verdict, trend) => trend?.began_utc_ns ?? [verdict.onset_utc_ns, verdict.onset_utc_ns];
 const between = ([from, to]) => (day(from).textContent === day(to).textContent ? ["on ", day(to)] : ["between ", day(from), " and ", day(to)]);
 
-// One verdict in a sentence, by the history where it shows the change, else by the verdict itself, with its date. Where U
-// is larger than the size, the change is sure all the same (by the verdict), but not its size.
-export function sentence(verdict, trend) {
-  const change = trend?.change, { unit, factor } = scaled(verdict.parameter, trend?.scale), name = named(verdict.parameter);
-  const of = change ?? { size: verdict.change, u_size: verdict.u_change, rate: verdict.rate, u_rate: verdict.u_rate, onset_utc_ns: verdict.onset_utc_ns };
-  const size = pair(of.size * factor, 2 * of.u_size * factor, unit), since = [day(of.onset_utc_ns), spread(of.u_onset_days)], at = between(beganOf(verdict, trend));
-  const told = change ? "." : ["; told on ", day(verdict.t_utc_ns), "."], sized = !(2 * of.u_size > Math.abs(of.size));
-  const down = of.size < 0, unsure = ["It is sure that it does, but not by how much: ", ...size];
-  if ((change?.shape ?? verdict.verdict) === "stepped") {
-    const fell = [...name, down ? " fell" : " rose"];
-    return (sized ? [...fell, " by ", ...size, " at once, ", ...at, "."] : [...fell, " at once, ", ...at, ". ", ...unsure, "."]).flat();
-  }
-  const days = Math.abs(of.rate * factor * MONTH_DAYS) < 0.1 ? [YEAR_DAYS, "year"] : [MONTH_DAYS, "month"];
-  const rate = [...pair(of.rate * factor * days[0], 2 * of.u_rate * factor * days[0], unit), ` a ${days[1]}`], falls = [...name, down ? " falls" : " rises"];
-  return (sized ? [...falls, " by ", ...rate, ", ", ...size, " since ", ...since, told] : [...falls, " since ", ...since, ". ", ...unsure, " so far, ", ...rate, told]).flat();
+// A verdict with its numbers: those of the history where it shows the change, else its own.
+function finding(verdict, trend) {
+  const own = { size: verdict.change, u_size: verdict.u_change, rate: verdict.rate, u_rate: verdict.u_rate, onset_utc_ns: verdict.onset_utc_ns };
+  return { ...own, ...trend?.change, parameter: verdict.parameter, shape: trend?.change?.shape ?? verdict.verdict, began: beganOf(verdict, trend), told_utc_ns: trend?.change ? null : verdict.t_utc_ns, ...scaled(verdict.parameter, trend?.scale) };
 }
+
+// What has changed and by how much: "sensitivity Sxx fell by 3.1 % (± 0.2 %)".
+function moved({ parameter, shape, size, u_size, rate, u_rate, unit, factor }) {
+  const by = pair(size * factor, 2 * u_size * factor, unit), down = size < 0;
+  if (shape === "stepped") return [...named(parameter), down ? " fell by " : " rose by ", ...by];
+  const [days, name] = Math.abs(rate * factor * MONTH_DAYS) < 0.1 ? [YEAR_DAYS, "year"] : [MONTH_DAYS, "month"];
+  return [...named(parameter), down ? " falls by " : " rises by ", ...pair(rate * factor * days, 2 * u_rate * factor * days, unit), ` a ${name}, `, ...by];
+}
+
+// A sentence for changes of one shape that began in the same time; with the date of the verdict where the history shows none.
+function sentence([first, ...rest]) {
+  const steps = first.shape === "stepped", [word, ...more] = moved(first), others = rest.flatMap((one, k) => [k ? ", " : ", and with it ", ...moved(one), steps ? "" : " so far"]);
+  const since = steps ? [] : [" since ", day(first.onset_utc_ns), spread(first.u_onset_days)], when = steps ? [rest.length ? ", " : " ", "at once, ", ...between(first.began)] : [];
+  return [word[0].toUpperCase() + word.slice(1), ...more, ...since, ...others, ...when, ...(steps || !first.told_utc_ns ? [] : ["; told on ", day(first.told_utc_ns)]), "."];
+}
+
+// What the verdicts of a sensor tell: a sentence for each cause that there may be, the largest change first. Changes that
+// begin in the same time, as of S and Q of one output, have one cause more likely than two.
+function findings(row, trends) {
+  const causes = [];
+  for (const one of row.verdicts.map((v) => finding(v, trends?.found?.[v.parameter]))) {
+    const same = causes.find(([first]) => first.shape === one.shape && first.began[0] <= one.began[1] && one.began[0] <= first.began[1]);
+    same ? same.push(one) : causes.push([one]);
+  }
+  return causes.map(sentence);
+}
+const inTurn = (sentences) => sentences.flatMap((one, k) => (k ? [" ", ...one] : one));
 
 // Whether the values that a sensor measures, corrected with S and Q in force, may be used: [tone, sentence]. By status,
 // verdicts and hearing alone; U is that of the calibration in force, and holds while windows fit it.
@@ -48,7 +69,7 @@ export function covered(row, trends) {
   const until = good ? ["Values until the last window that fitted (", day(last), ") may be used: ", ...U, ". "] : [];
   if (row.kind === "uncalibrated" || !row.calibration_utc_ns) return ["off", [make("b", "Values may not be used yet"), ": no calibration is in force."]];
   if (row.kind === "doubled") return ["bad", [make("b", "Values may not be used"), ": two gateways have this name, and nobody knows whose calibration is shown."]];
-  if (row.kind === "silent") return ["off", [...until, make("b", "Of later values nobody knows"), "."]];
+  if (isUnheard(row)) return ["off", [...until, make("b", "Of later values nobody knows"), "."]];
   if (row.kind === "no data") return ["bad", [...until, make("b", "Later values may not be used"), ": no window has confirmed them."]];
   if (row.status === "HELD") {
     const hold = ON_HOLD.test(row.reason);
@@ -61,9 +82,11 @@ export function covered(row, trends) {
   return ["ok", [make("b", "Values of today may be used"), ": ", ...U, ...old, ...late, "."]];
 }
 
-function often(verdict) {
-  const years = 1 / verdict.false_alarms_a_year;
-  return finite(years) && years > 0 ? `A sound sensor is told so once in ${two(years)} years at most.` : "";
+// How sure the first verdict is, and its size where that is less sure.
+function often(row, trends) {
+  const [verdict] = row.verdicts, { size, u_size, unit, factor } = finding(verdict, trends?.found?.[verdict.parameter]), years = 1 / verdict.false_alarms_a_year, U = 2 * u_size * factor;
+  const told = finite(years) && years > 0 ? `A sound sensor is told so once in ${two(years)} years at most. ` : "";
+  return U > Math.abs(size * factor) ? `${told}How far it has changed is less sure: U of the change is ± ${two(U)}${unit}. ` : told;
 }
 
 function steady(row) {
@@ -74,11 +97,12 @@ function steady(row) {
 }
 
 // What the other sensors with the same reference say of it.
+const clearsReference = (beside) => beside?.count > 0 && beside.changed * 2 < beside.count;
 function witnessed(beside) {
   if (!beside) return "";
   if (!beside.count) return "No other sensor with this reference can witness: nothing here tells sensor from reference.";
   const others = `${beside.count - beside.changed} of ${beside.count} other sensors with the same reference are steady`;
-  return beside.changed * 2 >= beside.count ? `Only ${others}: look at the reference first.` : `${others}: rather this sensor than its reference.`;
+  return clearsReference(beside) ? `${others}: rather this sensor than its reference.` : `Only ${others}: look at the reference first.`;
 }
 
 // The present of a sensor: the time that its gateway has reached while it catches up, as a simulated one may.
@@ -121,13 +145,17 @@ function inWords({ best, alike, fits, least, limit }) {
   return [`${COUNTS[all.length] ?? all.length} explanations fit about equally: `, ...named, fits ? ` ${chi2}.` : `; none fits within chance ${chi2}.`];
 }
 
+// A gateway cannot tell another reference from another sensor; whether others with this reference contradict it.
+const blamesReference = (why) => Boolean(why?.best) && [why.best, ...why.alike].every((each) => each.startsWith("reference "));
+const isContradicted = (why, trends) => blamesReference(why) && clearsReference(trends?.beside);
+
 const ON_HOLD = /^put on hold by/;
 
 // {say, more} of a sensor that is held, perhaps with a step.
 function heldWords(row, verdicts, trends) {
   const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason);
   const reason = why ? [`${why.held} windows ${why.agree ? "agree with what the calibration may have become." : "contradict the calibration."}`] : [row.reason, "."];
-  return { say: [...since, ...(verdicts.length ? verdicts.flatMap((v) => [...v, " "]) : reason)], more: [...(why ? [...inWords(why), " "] : verdicts.length ? [...reason, " "] : []), ON_HOLD.test(row.reason) ? "" : witnessed(trends?.beside)] };
+  return { say: [...since, ...(verdicts.length ? inTurn(verdicts) : reason)], more: [...(why ? [...inWords(why), " "] : verdicts.length ? [...reason, " "] : []), ON_HOLD.test(row.reason) ? "" : `${isContradicted(why, trends) ? "But " : ""}${witnessed(trends?.beside)}`] };
 }
 
 // What is said of a sensor that is in order: its largest change of a main sensitivity, and what was adopted.
@@ -147,15 +175,20 @@ export function largest(trends) {
   return most && { ...most, U: most.U > 0 && finite(most.U) ? most.U : 0.01 };
 }
 
+// Since when nothing is heard of a sensor. What came late is older than that.
+function silence(row) {
+  const late = row.heard_utc_ns - row.result_utc_ns > DAY_NS ? [" Its results came late: the newest one is of ", make("b", day(row.result_utc_ns)), `, ${ago(row.result_utc_ns)} ago.`] : [];
+  return ["Not heard since ", make("b", moment(row.heard_utc_ns)), `, ${ago(row.heard_utc_ns)} ago${row.gateway_state === "silent" ? "" : ", though its gateway is on the bus"}.`, ...late];
+}
+
 // {say, more} of a sensor.
 export function told(row, trends) {
-  const verdicts = row.verdicts.map((v) => sentence(v, trends?.found?.[v.parameter]));
+  const verdicts = findings(row, trends);
   const reason = row.reason ? [row.reason, "."] : [], since = trends?.held_utc_ns ?? row.status_utc_ns;
-  const newest = row.heard_utc_ns - row.result_utc_ns > DAY_NS ? ["; its newest result is of ", day(row.result_utc_ns)] : [];
-  if (row.kind === "silent") return { say: ["Not heard since ", make("b", moment(row.heard_utc_ns)), ` (${duration(now() - row.heard_utc_ns)}${row.gateway_state === "silent" ? "" : ", though its gateway is on the bus"})`, ...newest, "."], more: verdicts.flatMap((v) => ["Before: ", ...v, " "]) };
-  if (row.kind === "doubled") return { say: ["Two gateways have this name, and their results are mixed."], more: verdicts.flatMap((v) => ["One of them: ", ...v, " "]) };
+  if (isUnheard(row)) return { say: silence(row), more: inTurn(verdicts.map((v) => ["Before: ", ...v])) };
+  if (row.kind === "doubled") return { say: ["Two gateways have this name, and their results are mixed."], more: inTurn(verdicts.map((v) => ["One of them: ", ...v])) };
   if (row.kind === "held") return heldWords(row, verdicts, trends);
-  if (verdicts.length) return { say: verdicts.flatMap((v) => [...v, " "]), more: [often(row.verdicts[0]), " ", ...steady(row), witnessed(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
+  if (verdicts.length) return { say: inTurn(verdicts), more: [often(row, trends), ...steady(row), witnessed(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
   if (row.kind === "no data") return { say: ["No data since ", make("b", moment(since)), ": ", ...reason], more: [] };
   if (row.kind === "uncalibrated") return { say: [row.status === "COLLECTING" ? "Windows are being collected: " : "No calibration is in force: ", ...reason], more: [] };
   return soundWords(row, trends);
@@ -164,8 +197,10 @@ export function told(row, trends) {
 const BELOW = " by the command below";
 // What the agent says there is to do, without the command, which stands below; the mount where it knows nothing better.
 // Since it said that no estimate can be put in force one may have come (`waits`).
-function advice(reason, waits) {
-  const why = explanation(reason), todo = waits ? why?.todo.replace(/ Otherwise: no estimate can be put in force.*$/, "") : why?.todo;
+function advice(reason, waits, trends) {
+  const why = explanation(reason);
+  if (isContradicted(why, trends)) return "Look at the sensor and its mount: its gateway names the reference, but other sensors with this reference are steady.";
+  const todo = waits ? why?.todo.replace(/ Otherwise: no estimate can be put in force.*$/, "") : why?.todo;
   const told = why?.best && todo.replace(/: fieldcal command accept --sequence \d+$/, BELOW).replace(/([^.])$/, "$1.");
   if (told?.startsWith("Correct it")) return `Another ${make("span", cause(why.best)).textContent}? ${told}`;
   return told || "Look at the mount. If it is loose, fasten it: windows that fit again end HELD.";
@@ -180,7 +215,7 @@ export function steps(row, trends) {
   const gateway = clean(`${row.site}/${row.gateway}`), order = (verb, given) => commandLine({ gateway, sensor: row.sensor, verb, arguments: given }, "--connect ENDPOINT"), here = `on gateway ${gateway}:`;
   const visit = () => [make("p", `Compare it with another reference, ${here}`), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${row.sensor}`)];
   const waits = row.estimate && row.estimate_utc_ns >= (trends?.held_utc_ns ?? row.status_utc_ns) && row.status === "HELD";
-  const told = row.kind === "held" ? advice(row.reason, waits) : "", asked = told.includes(BELOW) ? `Run it ${KEYED}` : `If the sensor has really changed, accept estimate ${row.estimate}, ${KEYED}`;
+  const told = row.kind === "held" ? advice(row.reason, waits, trends) : "", asked = told.includes(BELOW) ? `Run it ${KEYED}` : `If the sensor has really changed, accept estimate ${row.estimate}, ${KEYED}`;
   const accept = waits ? [make("p", asked), copier(order("accept", { sequence: row.estimate }))] : [];
   if (row.kind === "silent") return [make("p", `Look at power and network, then ${here}`), copier(`fieldcal doctor ${GATEWAY}`)];
   if (row.kind === "changed") return [make("p", "Find out what happened to it: mount, cable, temperature, reference."), ...visit()];
@@ -198,7 +233,7 @@ export function steps(row, trends) {
 export function cardPlot(row, trends) {
   if (!trends?.t_utc_ns?.length) return [];
   const verdict = row.verdicts[0], trend = verdict && trends.found?.[verdict.parameter], beyond = trends.estimates ?? [], later = beyond.map((e) => e.t_utc_ns);
-  const marks = trends.refused_utc_ns ? [trends.held_utc_ns] : [], to = row.kind === "silent" ? trends.t_utc_ns.at(-1) : timeOf(row), stays = row.kind !== "silent" && row.kind !== "no data";
+  const marks = trends.refused_utc_ns ? [trends.held_utc_ns] : [], to = isUnheard(row) ? trends.t_utc_ns.at(-1) : timeOf(row), stays = !isUnheard(row) && row.kind !== "no data";
   const more = { marks, to, refused: trends.refused_utc_ns ?? [], dashed: later.length > 0 };
   if (!trend?.t_utc_ns.length) return [small(trends.main_pct.flatMap((v, i) => [going(trends.t_utc_ns, v, null, AXES[i], stays && to), ...estimated(later, beyond.map((e) => e.main_pct[i]), null, AXES[i])]), " %", "Main S", more)];
   const { unit, factor } = scaled(verdict.parameter, trend.scale), first = trend.values[0], k = NAMES.indexOf(verdict.parameter), tone = toneOf(verdict.parameter);
