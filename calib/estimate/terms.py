@@ -243,9 +243,10 @@ def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
             setups.setdefault(_setup(pose), []).append(p)
         elif own_channels(pose.direction.shape[1]) == 1:
             free.append(p)
-    for setup, alike in setups.items():
+    for number, (setup, alike) in enumerate(setups.items()):  # the name of the first one stays when others come
         for name, way in (("lateral", lateral), ("vertical", vertical)):
-            yield from _across(f"transverse_{name}{setup}", "", priors, _only(poses, alike, way[alike]))
+            own = f"transverse_{name}{setup if number else ''}"
+            yield from _across(own, "", priors, _only(poses, alike, way[alike]))
     for p in free:
         position = poses[p].position
         for name, k in zip("ab", np.linalg.svd(poses[p].direction[:, :1])[0].T[1:], strict=True):
