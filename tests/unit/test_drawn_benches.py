@@ -1,5 +1,5 @@
-"""Benches drawn at random, that no other test has together: a uniaxial reference, positions set by hand, motion in
-bursts, clocks that run apart, a filter nobody states, hum and lost samples. S and Q are within 4 u, and few are refused."""
+"""Benches drawn at random: a uniaxial reference, positions set by hand, motion in bursts, clocks that run apart, a filter
+that nobody states, hum and lost samples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transverse motion is one unknown where what moves the sensor stands alike, and another one where it was set up anew."""
+"""Transverse motion is one unknown where what moves the sensor stands alike, and another where it was set up anew."""
 
 from __future__ import annotations
 
