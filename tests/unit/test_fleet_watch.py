@@ -35,7 +35,7 @@ def lines() -> list[dict[str, Any]]:
                 "gateway": gateway, "sensor": sensor, "hour_utc_ns": (FIRST_H + hour) * HOUR_NS, "duration_s": 3600.0,
                 "samples": 360_000, "sequence": hour, "noise_psd": [1e-6] * 3, "band_hz": BANDS_HZ,
                 "band_power": (np.exp(2.0 * a) + 1e-6).ravel().tolist(), "cross_power": cross.ravel().tolist(),
-                "temperature_degc": degc, "calibration_run_id": "run", "calibration_sequence": 3,
+                "temperature_degc": float(degc), "calibration_run_id": "run", "calibration_sequence": 3,
                 "u_main_pct": [0.2] * 3,
             })  # fmt: skip
     return made

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.model import Array
-from calib.site_watch.day import Day, Hours, day_of
+from calib.site_watch.day import Day, Hours, Visits, day_of
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR, TERMS, Steps, inverted
 from calib.site_watch.together import ALL, DIRECTIONS, design, jointly
@@ -223,7 +223,7 @@ def test_what_all_share_is_seen_by_a_sensor_beside_a_reference_alone(learned: tu
 def test_a_visit_begins_the_norm_anew(learned: tuple[Site, SiteWatch]) -> None:
     site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
     change[4, :3] = 0.05
-    watch.update(site.day(change), np.arange(9) == 4)
+    watch.update(site.day(change), Visits.unknown(np.arange(9) == 4))
     found = result(watched(site, 12, watch, change))
     assert kinds(found) == {4: "learning"}
     assert kinds(result(watched(site, 20, watch, change))) == {}
