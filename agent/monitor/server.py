@@ -138,6 +138,7 @@ class _Data:
         bus["notices"] = self._notifier.fault if self._notifier is not None else ""
         fleet.look()
         return _json({"version": fleet.version, "now_utc_ns": time.time_ns(), "sensors": fleet.rows(_since(request)),
+        "sites": self._watching.changed_sites(),
                       "gateways": fleet.gateways(following.refused), "bus": bus})  # fmt: skip
 
     def trends(self, request: Request) -> Response:

@@ -81,6 +81,15 @@ class SiteWatching:
                 end_s = self._clock_s()
                 self._rests[site] = end_s + REST * (end_s - begin_s)
 
+    def changed_sites(self) -> list[dict[str, Any]]:
+        """The sites of which the structure has changed: `site`, `what`, `since`, `earliest`, `latest`."""
+        names = "what", "since", "earliest", "latest"
+        return [
+            {"site": site} | {name: told["site"][name] for name in names}
+            for site, told in sorted(self.told.items())
+            if told["site"]["verdict"] == "structure"
+        ]
+
     def _ask(self, site: str) -> None:
         source = source_of(self._database.query, site, closed=True, turn=self._turn)
         if not source.sensors:
@@ -88,7 +97,11 @@ class SiteWatching:
         source.left_out = Counter(self._database.watch.left_out)  # of all sites, since the start
         view = seen(source)
         told = plain(as_object(view)) | {"until_day": view.found.day}
-        self.told[site] = msgspec.json.decode(msgspec.json.encode(told))
+        before, self.told[site] = self.told.get(site), msgspec.json.decode(msgspec.json.encode(told))
+        structure = self.told[site]["site"]
+        if structure["verdict"] == "structure" and (before is None or before["site"]["verdict"] != "structure"):
+            text = f"structure: {structure['what']} since {structure['since']}"
+            self._fleet.note(site, "all", "structure", "watch", view.found.day * DAY_NS + DAY_NS, text, alarm=True)
         keep_told(self._database.query, site, view.found.day, self.told[site])
         self._fleet.set_suspected(site, _suspicions(self.told[site]), view.found.day * DAY_NS + DAY_NS)
 

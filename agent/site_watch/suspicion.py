@@ -36,7 +36,8 @@ class ToldWitness(msgspec.Struct):
 
 class Suspicion(msgspec.Struct):
     """A change that the site tells of a sensor: of the sensitivity of `axes` (x, y, z or xyz), relative; or a `turn`
-    about one axis, in rad. U with k = 2; dates of UTC."""
+    about one axis, in rad. U with k = 2; dates of UTC. `visit_information_nat`: what a visit of the sensor would tell.
+    """
 
     gateway: str
     sensor: str
@@ -49,6 +50,7 @@ class Suspicion(msgspec.Struct):
     latest: str
     witnesses: list[ToldWitness]
     text: str
+    visit_information_nat: float | None = None
 
     def enlarged(self, sensitivity: Array, covariance: Array) -> Array:
         """The covariance (12, 12) of S and Q with the suspected change; `sensitivity` (3, 3): S in force.

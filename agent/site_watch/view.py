@@ -62,6 +62,7 @@ class SiteView:
             gateway=gateway, sensor=sensor, axes=AXES_OF[told.direction], turn=told.kind == "turn", size=told.size,
             expanded_uncertainty=told.U, since=date(told.since), earliest=date(told.earliest), latest=date(told.latest),
             witnesses=[witness_of(one) for one in told.witnesses], text=sentence(told),
+            visit_information_nat=dict(self.order).get(i),
         )  # fmt: skip
 
     @property

@@ -45,6 +45,10 @@ SAID = [
      "No data since"),
     ("not heard", "Values until the last window that fitted .+ may be used: .+Of later values nobody knows",
      "Not heard since .+; its newest result is of"),
+    ("suspected", r"Values of today may be used with a larger U: ± 2.3 %, which holds the suspected change\. S and Q "
+     r"in force stay as they are\. Values before 2026-05-01 may be used with U as it was\.",
+     r"Suspected: Sensitivity of x fell by 1.10 % \(± 0.30 %\) since 2026-05-03 \(between 2026-05-01 and "
+     r"2026-05-05\)\."),
     ("not calibrated", "Values may not be used yet: no calibration is in force", "Windows are being collected"),
 ]  # fmt: skip
 NO_CLIPBOARD = "Object.defineProperty(Navigator.prototype, 'clipboard', { get: () => undefined });"  # as over http

@@ -2,17 +2,19 @@
 import { make, text } from "./common.js";
 import { finite } from "./format.js";
 
-// What a sensor counts as (agent.monitor.fleet): its words, its colour, and what they mean. The last two are of cards.
+// What a sensor counts as (agent.monitor.fleet): its words, its colour, and what they mean. The last three are of cards.
 export const KINDS = {
   sound: ["in order", "ok", "windows fit the calibration in force, and no drift is found"],
   drifting: ["drifting", "bad", "S or Q changes slowly; the calibration follows, and U covers it"],
   changed: ["changed", "bad", "S or Q has changed at once, and the change was adopted"],
   held: ["held", "warn", "new windows contradict the calibration in force, or an operator put it on hold"],
+  suspected: ["suspected", "warn", "the other sensors of its site say that its sensitivity or direction has changed"],
   silent: ["not heard", "off", "the gateway has left the bus, or three intervals have no result"],
   "no data": ["no data", "bad", "the gateway gets no samples of the sensor"],
   uncalibrated: ["not calibrated", "off", "no calibration is in force yet"],
   doubled: ["two of one name", "bad", "two gateways have one name, so nobody knows whose results these are"],
   gateway: ["gateway", "warn", "the gateway itself needs a person"],
+  structure: ["structure", "warn", "the site says that the structure has changed"],
   over: ["over", "off", "this no longer needs a person"],
 };
 export const chip = (kind) => make("span", KINDS[kind][0], { class: `chip ${KINDS[kind][1]}`, title: KINDS[kind][2] });
