@@ -14,11 +14,13 @@ import msgspec
 import numpy as np
 
 from agent.config.files import read_file
+from agent.core.events import CalibrationUpdate
 from agent.site_watch.source import WatchError
 from calib.model import Array
 from calib.site_watch.verdicts import COVERAGE, SensorVerdict
 from calib.site_watch.witnesses import Witness
 
+SOURCE = "suspected change"  # of a budget
 LARGEST_FILE = 64 << 20  # bytes of a file of verdicts; a sensor has 2 kB
 # Of calib.site_watch.together.DIRECTIONS; the last is of a gateway (direction -1).
 AXES_OF = ("x", "y", "z", "xyz", "x", "y", "z", "xyz")
@@ -69,6 +71,24 @@ class Suspicion(msgspec.Struct):
         variance = self.size**2 + (self.expanded_uncertainty / COVERAGE) ** 2
         return np.asarray(covariance + variance * np.outer(moved, moved))
 
+    def holds_of(self, made_utc_ns: int) -> bool:
+        """Whether a calibration was made before the change; one that was made after it has found it."""
+        return made_utc_ns <= _ns(self.latest)
+
+    def update(self, update: CalibrationUpdate) -> CalibrationUpdate:
+        """A result that tells the calibration in force, with the enlarged uncertainty where it is of a time after the
+        change; else as it is."""
+        if update.t_utc_ns < _ns(self.earliest) or not self.holds_of(update.date_utc_ns):
+            return update
+        before = np.array(update.covariance)
+        covariance = self.enlarged(np.array(update.sensitivity), before)
+        added = np.diag(covariance) - np.diag(before)
+        u = np.sqrt(np.square(update.standard_uncertainty) + added)
+        budget = update.budget and update.budget | {SOURCE: np.sqrt(added).tolist()}
+        return msgspec.structs.replace(
+            update, covariance=covariance.tolist(), standard_uncertainty=u.tolist(), budget=budget
+        )
+
     def enlarged_u_pct(self, u_pct: float, axis: str) -> float:
         """U (k = 2) in % of the main sensitivity of `axis` with the suspected change; `u_pct`: U in force."""
         if self.turn or axis not in self.axes:
@@ -97,6 +117,10 @@ def suspicions_in(path: Path) -> list[Suspicion]:
     for one in found:
         numbers = one.size, one.expanded_uncertainty
         axes = one.axes in (("x", "y", "z") if one.turn else ("x", "y", "z", "xyz"))
+        try:
+            list(map(_ns, (one.since, one.earliest, one.latest)))
+        except ValueError:
+            raise WatchError(f"{path}: a date of {one.gateway}/{one.sensor} is none of a calendar") from None
         if not axes or not all(math.isfinite(value) and abs(value) < 10.0 for value in numbers):
             raise WatchError(f"{path}: what is suspected of {one.gateway}/{one.sensor} is not a change of x, y or z")
     return found
@@ -157,6 +181,11 @@ def since(told: SensorVerdict) -> str:
         return ""
     reach = max(told.latest - told.since, told.since - told.earliest, 1)
     return f"{date(told.since)} ± {reach} d"
+
+
+def _ns(day: str) -> int:
+    """The begin of a day of UTC, in ns since 1970."""
+    return int(datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp()) * 10**9
 
 
 def date(day: int) -> str:

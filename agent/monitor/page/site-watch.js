@@ -22,7 +22,7 @@ export function suspectedWords({ suspected: s }) {
   const heard = s.witnesses.map((w) => witness(w, s.turn)).join(", "), contradicted = s.witnesses.some((w) => w.says === "contradicts");
   return {
     say: ["Suspected: ", ...change, " since ", ...when(s), "."],
-    more: [heard ? `${heard[0].toUpperCase()}${heard.slice(1)}. ` : "All sensors of its gateway have changed alike. ", contradicted ? "So rather the structure at the sensor, or its mount, has changed. " : "", "The other sensors of the site tell it, or else the structure at this sensor moves otherwise in all bands."],
+    more: [heard ? `${heard[0].toUpperCase()}${heard.slice(1)}. ` : "All sensors of its gateway have changed alike. ", contradicted ? "So rather the structure at the sensor, or its mount, has changed." : s.witnesses.slice(1).some((w) => w.says === "agrees") ? "So the sensor itself has changed." : "The sensor has changed, or the structure at it moves otherwise in all bands alike."],
   };
 }
 
@@ -43,10 +43,10 @@ export async function showSiteWatch(place) {
   const least = one.least_detectable_pct.map((v) => (v === null ? "not yet" : `${two(v)} %`)).join(", "), degc = one.temperature_range_degc;
   const rank = told.visit_order.indexOf(`${one.gateway}/${one.sensor}`) + 1;
   const rows = [
-    ["Verdict", one.what ? `${one.verdict}: ${one.what}` : one.verdict], ["Until", told.until], ["Days that teach it", one.days],
-    ["Change that would be found, x, y, z", least],
-    ["Temperatures seen", degc[0] === null ? "none" : `${two(degc[0])} to ${two(degc[1])} °C${one.outside_temperature_range ? "; the last day was outside" : ""}`],
-    ["Place in the order of visits", rank ? `${rank} of ${told.visit_order.length}` : "none: it has a reference"],
+    ["Verdict", one.what ? `${one.verdict}: ${one.what}` : one.verdict], ["Until", told.until], ["Days", one.days],
+    ["Least change", `${least} (x, y, z)`],
+    ["Temperatures", degc[0] === null ? "none" : `${two(degc[0])} to ${two(degc[1])} °C${one.outside_temperature_range ? "; the last day was outside" : ""}`],
+    ["Visit", rank ? `${rank} of ${told.visit_order.length}` : "none: it has a reference"],
   ];
   const visits = told.visits.filter((v) => v.sensor === `${one.gateway}/${one.sensor}`).map((v) => [v.date, v.suspicion, `${signed(v.found_pct, v.expanded_uncertainty_pct)} ± ${two(v.expanded_uncertainty_pct)} %`]);
   $("site-watch").replaceChildren(make("dl", rows.flatMap(([title, value]) => [make("dt", title), make("dd", value)]), { class: "facts" }), ...(visits.length ? [table("Visits", ["Visit", "Suspicion", "Change found"], visits)] : []), make("p", told.not_seen.join(" "), { class: "hint" }));
