@@ -26,17 +26,22 @@ def teach(watch: SiteWatch, visits: Visits, known_u: Array | None = None) -> Non
     if not len(known) or watch.day < 0:
         return
     told = result(watch, known_u)
-    rows = [_row(int(i), watch.day + 1, told.sensors[i], told.least_detectable[i], visits) for i in known]
+    rows = []
+    for i in known.tolist():
+        with_gateway = told.gateways.get(int(watch.gateway[i]))
+        verdict = told.sensors[i] if with_gateway is None else with_gateway
+        rows.append(_row(i, watch.day + 1, verdict, told.least_detectable[i], visits))
     made = [row for row in rows if row is not None]
     if made:
         watch.visits = np.concatenate([watch.visits, np.array(made)])
 
 
 def _row(i: int, day: int, told: SensorVerdict, least: Array, visits: Visits) -> list[float] | None:
-    """A row of VISIT; None where the watch said nothing of this sensor."""
+    """A row of VISIT; None where the watch said nothing of this sensor. `told`: of the sensor, or of its gateway."""
     found, u_found = visits.found[i], float(visits.u[i])
-    if told.kind == "sensitivity":
-        axes = np.flatnonzero(DIRECTIONS[told.direction][:3])
+    suspected = told.kind in ("sensitivity", "gateway")
+    if suspected:
+        axes = np.flatnonzero(DIRECTIONS[told.direction][:3]) if told.kind == "sensitivity" else np.arange(3)
         size, u = told.size, told.U / COVERAGE
     elif told.kind == "none" and np.isfinite(least).any():
         axes, size, u = np.arange(3), 0.0, float(np.min(least)) / COVERAGE
@@ -47,7 +52,7 @@ def _row(i: int, day: int, told: SensorVerdict, least: Array, visits: Visits) ->
         return None
     mean = float(np.mean(own))
     row = {
-        "sensor": i, "day": day, "suspected": told.kind == "sensitivity", "size": size, "u": u, "found": mean,
+        "sensor": i, "day": day, "suspected": suspected, "size": size, "u": u, "found": mean,
         "u_found": u_found,
     }  # fmt: skip
     return [float(row[name]) for name in VISIT]

@@ -374,6 +374,20 @@ def test_visits_tell_what_all_sensors_share(learned: tuple[Site, SiteWatch]) -> 
     assert found.sensors[4].kind == "learning"
 
 
+def test_a_visit_of_a_gateway_that_was_told_finds_its_change_not_a_common_one(
+    learned: tuple[Site, SiteWatch],
+) -> None:
+    site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
+    change[3:6, :3] = -0.02
+    watched(site, 12, watch, change)
+    assert list(result(watch).gateways) == [1]
+    teach(watch, found_at([3, 4, 5], -0.02))
+    found = result(watch)
+    assert found.common is not None
+    assert abs(found.common.size) < found.common.U
+    assert watch.visits[:, VISIT.index("suspected")].tolist() == [1, 1, 1]
+
+
 def test_gravity_is_asked_at_the_date_of_the_change(learned: tuple[Site, SiteWatch]) -> None:
     """z of sensor 4 loses 3 %, gravity with it; of sensor 6 it loses 3 % too, which gravity does not share."""
     site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
