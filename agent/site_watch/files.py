@@ -39,6 +39,7 @@ class _Files:
     def __init__(self) -> None:
         self.numbers: dict[tuple[str, str], int] = {}
         self.bands: set[int] = set()
+        self.site = ""  # that of the first line that names one
         self.lines = 0
         self.left_out: Counter[str] = Counter()
         self.first: dict[str, str] = {}
@@ -49,10 +50,13 @@ class _Files:
         self.left_out[reason] += 1
         self.first.setdefault(reason, place)
 
-    def take(self, hour: WatchHour, gateway: str, at: Place | bytes) -> str:
+    def take(self, hour: WatchHour, site: str, gateway: str, at: Place | bytes) -> str:
         """Note an hour. Returns why it is left out; "" where it is used."""
         if reason := wrong(hour):
             return reason
+        self.site = self.site or site
+        if site and self.site != site:
+            return "of another site than the first line that names one; give the files of one site"
         i = self.number(gateway, hour.sensor)
         if i is None:
             return f"more than {MOST_SENSORS} sensors"
@@ -118,9 +122,10 @@ def _line(found: _Files, at: Place, data: bytes, stem: str) -> str:
         if (told := _calibration(data)) is None:
             return f"not a watch result: {_short(str(error))}"
         found.lines -= 1
-        found.calibrated(told, told.gateway or _named(told.key) or stem)
+        found.calibrated(told, told.gateway or _named(told.key)[1] or stem)
         return ""
-    return found.take(line, line.gateway or _named(line.key) or stem, at)
+    site, gateway = _named(line.key)
+    return found.take(line, line.site or site, line.gateway or gateway or stem, at)
 
 
 def _calibration(data: bytes) -> CalibrationLine | None:
@@ -130,23 +135,23 @@ def _calibration(data: bytes) -> CalibrationLine | None:
         return None
 
 
-def _named(key: str) -> str:
-    """The gateway in a key on the bus; "" where it has none."""
+def _named(key: str) -> tuple[str, str]:
+    """Site and gateway in a key on the bus; "" where it has none."""
     parts = key.split("/")
-    return parts[3] if len(parts) == 6 and parts[:2] == ["fieldcal", "v1"] else ""
+    return (parts[2], parts[3]) if len(parts) == 6 and parts[:2] == ["fieldcal", "v1"] else ("", "")
 
 
 def _read_recording(found: _Files, path: Path) -> None:
     """Take the results of a recording, as far as it can be read."""
-    reader, gateway = RecordingReader(path), path.stem
+    reader, site, gateway = RecordingReader(path), "", path.stem
     for step in reader.steps():
         if isinstance(step.event, RunStart):
-            gateway = step.event.gateway or gateway
+            site, gateway = step.event.site, step.event.gateway or gateway
         for result in step.results:
             if isinstance(result, WatchReport):
                 found.lines += 1
                 hour = WatchHour(**_as_json(result))
-                if reason := found.take(hour, gateway, msgspec.msgpack.encode(hour)):
+                if reason := found.take(hour, site, gateway, msgspec.msgpack.encode(hour)):
                     found.leave_out(reason, f"{path}: result {result.sequence}")
             elif isinstance(result, CalibrationUpdate):
                 line = CalibrationLine(sensor=result.sensor, sensitivity=_known(result.sensitivity),

@@ -167,12 +167,22 @@ def witness_of(one: Witness) -> ToldWitness:
     return ToldWitness(one.name, one.says, one.size if known else None, COVERAGE * one.u if known else None)
 
 
+def relative(told: SensorVerdict) -> tuple[float, float]:
+    """Size and U of a verdict as a part of the sensitivity; the watch tells its logarithm. An angle or a noise as it
+    is.
+    """
+    if told.kind in ("sensitivity", "gateway", "common"):
+        return math.expm1(told.size), math.exp(told.size) * told.U
+    return told.size, told.U
+
+
 def sized(told: SensorVerdict) -> str:
     """The size with U; "" where there is none."""
     if not math.isfinite(told.U):
         return ""
     unit, factor = TOLD_UNITS.get(told.kind, TOLD_UNITS[""])
-    return f"{factor * told.size:+.2f} ± {factor * told.U:.2f}{unit}"
+    size, U = relative(told)
+    return f"{factor * size:+.2f} ± {factor * U:.2f}{unit}"
 
 
 def since(told: SensorVerdict) -> str:

@@ -14,13 +14,14 @@ import numpy as np
 from agent import __version__
 from agent.site_watch.day_sum import days_of
 from agent.site_watch.source import SiteSource
-from agent.site_watch.suspicion import AXES_OF, Suspicion, date, sentence, since, sized, witness_of
+from agent.site_watch.suspicion import AXES_OF, Suspicion, date, relative, sentence, since, sized, witness_of
 from calib.model import Array
 from calib.site_watch.verdicts import COVERAGE, WALK_PER_ROOT_DAY, SensorVerdict, SiteVerdicts, result
 from calib.site_watch.visits import teach
 from calib.site_watch.watch import VISIT, SiteWatch
 
 U_VISIT = 0.003  # relative standard uncertainty of what a visit finds
+MUTE_DAYS = 3  # without a value, after which it is told
 U_UNKNOWN = 0.01  # of a calibration that states none
 DO = {
     "none": "nothing",
@@ -37,12 +38,14 @@ DO = {
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteView:
     """A site with its verdicts. `order`: sensors by what a visit would tell, most first, with the information in
-    nat. `visits`: rows of calib.site_watch.watch.VISIT."""
+    nat. `visits`: rows of calib.site_watch.watch.VISIT. `last`: the last day on which each sensor told something; 0 for
+    none."""
 
     source: SiteSource
     found: SiteVerdicts
     order: Sequence[tuple[int, float]]
     visits: Array
+    last: Array
 
     @property
     def changed(self) -> bool:
@@ -58,9 +61,10 @@ class SiteView:
             if with_gateway is None:
                 return None
             told = with_gateway
+        size, U = relative(told)
         return Suspicion(
-            gateway=gateway, sensor=sensor, axes=AXES_OF[told.direction], turn=told.kind == "turn", size=told.size,
-            expanded_uncertainty=told.U, since=date(told.since), earliest=date(told.earliest), latest=date(told.latest),
+            gateway=gateway, sensor=sensor, axes=AXES_OF[told.direction], turn=told.kind == "turn", size=size,
+            expanded_uncertainty=U, since=date(told.since), earliest=date(told.earliest), latest=date(told.latest),
             witnesses=[witness_of(one) for one in told.witnesses], text=sentence(told),
             visit_information_nat=dict(self.order).get(i),
         )  # fmt: skip
@@ -78,15 +82,16 @@ def seen(source: SiteSource, beside_reference: Sequence[int] = ()) -> SiteView:
     watch = SiteWatch(np.array([gateways.index(gateway) for gateway, _ in source.sensors]),
                       10.0 ** (np.array(source.bands) / 10.0))  # fmt: skip
     known, u_main = np.full(n, np.inf), np.full(n, np.nan)
-    beside = list(beside_reference)
+    beside, last = list(beside_reference), np.zeros(n)
     for day in days_of(source.sums(), source.numbers, source.bands):
         u_main = day.u_main
         known[beside] = np.where(np.isfinite(u_main[beside]), u_main[beside], U_UNKNOWN)
         if day.visits.there.any():
             teach(watch, day.visits, known)
         watch.update(day.day, day.visits)
+        last[np.isfinite(day.day.value).any(axis=(1, 2))] = day.day.number
     found = result(watch, known)
-    return SiteView(source, found, _order(source, found, u_main, beside), watch.visits)
+    return SiteView(source, found, _order(source, found, u_main, beside), watch.visits, last)
 
 
 def _order(
@@ -151,7 +156,11 @@ def not_seen(what: SiteView) -> list[str]:
         known = 100.0 * least[np.isfinite(least)]
         lines.append(f"Least change found 30 days after it: {np.median(known):.2g} % in the middle, "
                      f"{known.max():.2g} % at the worst sensor.")  # fmt: skip
-    outside = np.flatnonzero(found.outside).tolist()
+    mute = np.flatnonzero(found.day - what.last >= MUTE_DAYS).tolist()
+    if mute:
+        who = _some(names, mute)
+        lines.append(f"Nothing is told for {MUTE_DAYS} days or more by {who}: silent, dead, or all bands in the noise.")
+    outside = [i for i in np.flatnonzero(found.outside).tolist() if i not in mute]
     if outside:
         lines.append(f"The last day is warmer or colder than all days of the norm of {_some(names, outside)}.")
     return lines
@@ -179,6 +188,7 @@ def as_object(what: SiteView) -> dict[str, Any]:
                 **_told(found.sensors[i]),
                 "suspected": what.suspected(i),
                 "days": int(found.days[i]),
+                "last_day": date(int(what.last[i])) if what.last[i] else None,
                 "least_detectable_pct": 100.0 * found.least_detectable[i],
                 "temperature_range_degc": found.seen_degc[i],
                 "outside_temperature_range": bool(found.outside[i]),
@@ -198,12 +208,12 @@ def as_object(what: SiteView) -> dict[str, Any]:
 
 def _told(told: SensorVerdict) -> dict[str, Any]:
     unit, factor = ("rad", 1.0) if told.kind == "turn" else ("%", 100.0)
-    dated = told.since >= 0
+    dated, (size, U) = told.since >= 0, relative(told)
     return {
         "verdict": told.kind,
         "what": told.what,
-        "size": factor * told.size if math.isfinite(told.U) else None,
-        "expanded_uncertainty": factor * told.U if math.isfinite(told.U) else None,
+        "size": factor * size if math.isfinite(U) else None,
+        "expanded_uncertainty": factor * U if math.isfinite(U) else None,
         "unit": unit,
         "since": date(told.since) if dated else None,
         "earliest": date(told.earliest) if dated else None,
@@ -220,6 +230,6 @@ def _visit(what: SiteView, row: Sequence[float]) -> dict[str, Any]:
     return {
         "sensor": "/".join(what.source.sensors[int(told["sensor"])]), "date": date(int(told["day"])),
         "suspicion": verdict if told["suspected"] else "none",
-        "suspected_pct": 100.0 * told["size"] if told["suspected"] else None,
-        "found_pct": 100.0 * told["found"], "expanded_uncertainty_pct": 100.0 * COVERAGE * told["u_found"],
+        "suspected_pct": 100.0 * math.expm1(told["size"]) if told["suspected"] else None,
+        "found_pct": 100.0 * math.expm1(told["found"]), "expanded_uncertainty_pct": 100.0 * COVERAGE * told["u_found"],
     }  # fmt: skip

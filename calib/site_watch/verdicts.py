@@ -44,10 +44,10 @@ class SensorVerdict:
     """A verdict of a sensor or gateway.
 
     `kind`: none, learning, sensitivity, turn, noise, structure, sensor or structure, gateway. `what`: in words.
-    `size`, `U`: relative change of the sensitivity (of the amplitude of the noise), or angle in rad; expanded by
-    COVERAGE. `since`, `earliest`, `latest`: days since 1970. `statistic`: size over its standard uncertainty, or a
-    normal equivalent. `direction`: index in calib.site_watch.together.DIRECTIONS of a sensitivity or turn; -1 for
-    others.
+    `size`, `U`: change of the log of the sensitivity (relative change of the amplitude of the noise), or angle in
+    rad; expanded by COVERAGE. `since`, `earliest`, `latest`: days since 1970. `statistic`: size over its standard
+    uncertainty, or a normal equivalent. `direction`: index in calib.site_watch.together.DIRECTIONS of a sensitivity
+    or turn; -1 for others.
     `witnesses`: of a sensitivity or turn, the structure first.
     """
 

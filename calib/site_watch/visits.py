@@ -50,7 +50,7 @@ def _row(i: int, day: int, told: SensorVerdict, least: Array, visits: Visits) ->
     own = found[axes][np.isfinite(found[axes])]
     if not len(own):
         return None
-    mean = float(np.mean(own))
+    mean = float(np.mean(np.log1p(np.maximum(own, -0.99))))
     row = {
         "sensor": i, "day": day, "suspected": suspected, "size": size, "u": u, "found": mean,
         "u_found": u_found,

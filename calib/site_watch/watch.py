@@ -26,7 +26,7 @@ U_MEAN_MPS2 = 0.001  # of the mean of a day; only ratios of weights depend on it
 # The prior of the coefficients of the mean, in m/s² where steps.PRIOR has log amplitudes, is ten times as wide.
 MEAN_PRIOR_SCALE = 0.01
 # Of a visit: which sensor, when; whether its sensitivity was suspected; the change that the watch told (0 where it told
-# none) and what was found, relative, each with its standard uncertainty.
+# none) and what was found, as logarithms, each with its standard uncertainty.
 VISIT = "sensor", "day", "suspected", "size", "u", "found", "u_found"
 PRIOR_VISITS = 10.0  # suspicions that are worth what the scatter says of itself
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,50 @@ def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[di
     assert "learning" in next(line for line in told.output.splitlines() if line.startswith("middle/c"))
 
 
+@pytest.mark.slow
+def test_what_users_meet(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    """From some day on at one sensor: x and y exchanged, twice the sensitivity, dead outputs; wrong units at a gateway;
+    lines of another site among the others."""
+
+    def told(change: Callable[[dict[str, Any]], object], late: bool = True) -> dict[str, Any]:
+        rows = [dict(row) for row in clean]
+        for row in rows:
+            if row["sensor"] == "c" and row["sequence"] >= 24 * CHANGED:  # as if it had not changed
+                row["band_power"] = [*row["band_power"][:8], *(value / 0.97**2 for value in row["band_power"][8:])]
+            if not late or row["sequence"] >= 24 * CHANGED:
+                change(row)
+        found: dict[str, Any] = json.loads(run(tmp_path, rows, "--json", "-").stdout)
+        return found
+
+    def scaled(row: dict[str, Any], factor: float) -> None:
+        for name in ("band_power", "cross_power", "noise_psd"):
+            row[name] = [factor**2 * value for value in row[name]]
+
+    def exchanged(row: dict[str, Any]) -> None:
+        p, c = row["band_power"], row["cross_power"]
+        if row["sensor"] == "c":
+            row["band_power"], row["cross_power"] = [*p[4:8], *p[:4], *p[8:]], [*c[:4], *c[8:], *c[4:8]]
+
+    def one(found: dict[str, Any], sensor: str = "c") -> dict[str, Any]:
+        return next(each for each in found["sensors"] if each["sensor"] == sensor)
+
+    assert one(told(exchanged))["verdict"] == "sensor or structure"
+    doubled = one(told(lambda row: scaled(row, 2.0) if row["sensor"] == "c" else None))
+    assert (doubled["verdict"], doubled["what"]) == ("sensitivity", "sensitivity of x, y and z")
+    assert doubled["size"] == pytest.approx(100.0, abs=1.0), "in %, not its logarithm"
+    assert one(told(lambda _: None))["verdict"] == "none"
+    dead = told(lambda row: scaled(row, 0.0) if row["sensor"] == "c" else None)
+    assert one(dead)["last_day"] == "2024-10-31"
+    assert any("for 3 days or more by middle/c: silent, dead" in line for line in dead["not_seen"])
+    units = told(lambda row: scaled(row, 9.80665) if row["gateway"] == "north" else None)
+    north = units["gateways"]["north"]
+    assert north["size"] == pytest.approx(880.7, abs=north["expanded_uncertainty"])
+    mixed = told(lambda row: row.update(site="castle" if row["sensor"] == "f" else "bridge"), late=False)
+    assert list(mixed["left_out"]) == ["of another site than the first line that names one; give the files of one site"]
+    assert [each["sensor"] for each in mixed["sensors"]] == list("abcde")
+
+
+@pytest.mark.slow
 def test_a_visit_says_what_it_found_where_the_calibrations_are_told(
     tmp_path: Path, clean: list[dict[str, Any]]
 ) -> None:

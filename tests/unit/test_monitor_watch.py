@@ -120,7 +120,7 @@ def test_the_monitor_says_what_the_files_say_and_what_it_said_lasts(tmp_path: Pa
         assert c["suspected"]["u_pct"] == pytest.approx(U, rel=1e-3)
         assert c["u_pct"] < 0.1 < 5.0 < c["suspected"]["u_pct"], "U in force stays as it is"
         [alarm] = fleet.alarms()
-        assert alarm["text"].startswith("suspected: sensitivity of z has fallen by 3.")
+        assert alarm["text"].startswith("suspected: sensitivity of z has fallen by 2.9")
         later = Fleet(lambda: NOW_NS)
         assert SiteWatching(database, later).told == watching.told
         assert later.alarms() == []

@@ -98,7 +98,7 @@ def test_what_gravity_and_noise_say() -> None:
 
 def test_the_sentence_names_each_witness() -> None:
     told = SensorVerdict(
-        "sensitivity", "sensitivity of x", -0.011, 0.003, DAY, DAY - 2, DAY + 1, 4.1, 0,
+        "sensitivity", "sensitivity of x", np.log1p(-0.011), 0.003, DAY, DAY - 2, DAY + 1, 4.1, 0,
         (Witness("structure", "agrees", -0.011, 0.0027), Witness("gravity", "silent"), Witness("noise", "silent")),
     )  # fmt: skip
     assert sentence(told) == (
