@@ -161,8 +161,8 @@ class WatchStore:
 def close_day(query: QueryRunner) -> str | None:
     """Sum one stale day of a site that has gone on; the site, or None where there is no such day.
 
-    Each query is a transaction of its own, so results are kept meanwhile. Hours that come while a day is summed leave
-    it stale.
+    Each query is a transaction of its own, so results are kept meanwhile. A day of which hours come while it is summed
+    stays as it is, and is summed again.
     """
     rows = query(
         "SELECT d.site, d.day, d.stale FROM watch_day d WHERE d.stale > 0 AND EXISTS (SELECT 1 FROM watch_day l"
@@ -172,7 +172,7 @@ def close_day(query: QueryRunner) -> str | None:
         return None
     site, day, stale = rows[0]
     query(
-        "UPDATE watch_day SET stale = stale - :stale, payload = :payload WHERE site = :site AND day = :day",
+        "UPDATE watch_day SET stale = 0, payload = :payload WHERE site = :site AND day = :day AND stale = :stale",
         site=site, day=day, stale=stale, payload=msgspec.msgpack.encode(_summed(query, site, day)),
     )  # fmt: skip
     return str(site)

@@ -25,7 +25,7 @@ from agent.monitor.watch_store import KEPT_DAYS, close_day, packed, source_of, u
 from agent.site_watch.hour import TWICE, WatchHour
 from tests.unit.postgres import postgres
 from tests.unit.results import calibration, status
-from tests.unit.test_fleet_watch import CHANGED, FIRST_H, HOUR_NS, lines
+from tests.unit.test_fleet_watch import FIRST_H, HOUR_NS, lines
 from tests.unit.test_monitor_database import engine_of
 
 NOW_NS = (FIRST_H + 24 * 45) * HOUR_NS
@@ -225,20 +225,20 @@ def test_what_a_database_is_not(tmp_path: Path, rows: list[dict[str, Any]]) -> N
     assert "no database of the monitor" in refused(str(file))
 
 
-def test_a_change_is_not_told_before_its_day_has_closed(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+def test_a_change_is_not_told_before_its_day_has_closed(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
     """And a site rests after it was asked, so that a history that comes at once is not asked for each of its days."""
     clock = [0.0]
-    with closing(Sqlite(tmp_path / "monitor.sqlite")) as engine:
-        until = 24 * 3 + 5
-        database = kept(engine, [row for row in rows if row["sequence"] < until])
-        watching = SiteWatching(database, Fleet(), lambda: clock[0])
-        watching.step()
-        assert watching.told["bridge"]["until"] == "2024-10-05"
-        watching._rests["bridge"] = 100.0
-        database.add([received(row) for row in rows if until <= row["sequence"] < until + 30])
-        watching.step()
-        assert watching.told["bridge"]["until"] == "2024-10-05"
-        clock[0] = 100.0
-        watching.step()
-        assert watching.told["bridge"]["until"] == "2024-10-07"
-        assert CHANGED > 4
+    until = 24 * 3 + 5
+    database = kept(engine, [row for row in rows if row["sequence"] < until])
+    watching = SiteWatching(database, Fleet(), lambda: clock[0])
+    watching.step()
+    assert watching.told["bridge"]["until"] == "2024-10-05"
+    watching._rests["bridge"] = 100.0
+    database.add([received(row) for row in rows if until <= row["sequence"] < until + 30])
+    watching.step()
+    assert watching.told["bridge"]["until"] == "2024-10-05"
+    clock[0] = 100.0
+    watching.step()
+    assert watching.told["bridge"]["until"] == "2024-10-07"
+    again = SiteWatching(database, Fleet())
+    assert again.told == watching.told
