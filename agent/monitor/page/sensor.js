@@ -223,6 +223,7 @@ function sections(place, found, whole, hours, later) {
 // --- the view
 
 function begin(place) {
+  $("site-watch-card").hidden = true;
   const gateway = `${place.get("site")}/${place.get("gateway")}`, sensor = place.get("sensor");
   const hold = (given) => ({ gateway, sensor, verb: "hold", arguments: given });
   $("crumbs").replaceChildren(make("a", "Fleet", { href: "#" }), text(` / ${place.get("site")} / ${place.get("gateway")}`));
@@ -271,7 +272,7 @@ export async function show(told, go) {
     showBudget(newest, row, trends);
     showDevice(row, newest, found.clock, trends);
     showHypotheses(row, found.status);
-    showSiteWatch(place);
+    showSiteWatch(place, () => current === mine).catch(() => undefined); // the next change asks again
     showEvents(found.status, found.drift, found.estimate);
     refold(sections(place, found, whole, hours, later));
     for (const draw of later) draw();

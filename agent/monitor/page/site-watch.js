@@ -34,9 +34,10 @@ export const suspectedSteps = (row) => [make("p", row.suspected.turn ? "Look whe
 // A card for a site of which the structure has changed.
 export const structureCard = ({ site, what, since, earliest, latest }) => card({ kind: "structure", name: `site ${clean(site)}`, where: "all sensors together", say: ["The structure has changed: ", what, " since ", ...when({ since, earliest, latest }), "."], more: "Bands change differently at several sensors, which no sensitivity does.", plot: null, steps: [make("p", "Look at the structure at these sensors. On a machine with the data of the monitor:"), copier("fieldcal fleet watch monitor/monitor.sqlite")] });
 
-// The card of the view of a sensor: what the site says of it, or why it says nothing.
-export async function showSiteWatch(place) {
+// The card of the view of a sensor: what the site says of it, or why it says nothing. `shown`: whether it still is shown.
+export async function showSiteWatch(place, shown) {
   const told = await get(`api/watch?${new URLSearchParams({ site: place.get("site") })}`);
+  if (!shown()) return;
   const one = told?.sensors.find((s) => placeOf({ ...s, site: place.get("site") }).toString() === place.toString());
   $("site-watch-card").hidden = !one;
   if (!one) return;
