@@ -4,12 +4,16 @@
     python -m benchmarks.site_watch --sensors 8 --years 60 [--write]
     python -m benchmarks.site_watch --worlds [--write]
     python -m benchmarks.site_watch --cost [--write]
+    python -m benchmarks.site_watch --kept [--write]
+    python -m benchmarks.site_watch --year [--write]
 
 The bridge is simulated by benchmarks/beam_world.py, whose model is not the estimator's. A site learns for
-LEARNED_DAYS, each from another season on. Then each case changes one sensor (each in turn; every second case one
-axis alone), two at once, a gateway, or the structure. A case is looked at on the day that its mark names, damage on
+LEARNED_DAYS, each from another season on. Then each case changes one sensor (each in turn; every second case one axis
+alone), two at once, a gateway, or the structure. A case is looked at on the day that its mark names, damage on
 several days. Sound sites run for two years each and are looked at once a week; an alarm that was there four weeks
-before is the same one. `--minutes` ends it early: the table then has fewer cases, and says how many.
+before is the same one. `--kept` puts the hours of some days into a database of the monitor and repeats the days for a
+year; the monitor then watches the site from its days. `--minutes` ends it early: the table then has fewer cases, and
+says how many.
 """
 
 from __future__ import annotations
@@ -23,15 +27,27 @@ import copy
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import msgspec
 import numpy as np
 
+from agent.delivery.keys import Address
+from agent.delivery.received import Received
+from agent.monitor.database import Database
+from agent.monitor.engines import Sqlite
+from agent.monitor.watch_store import KEPT_DAYS, close_day, source_of
+from agent.site_watch.day_sum import DaySum
+from agent.site_watch.view import seen
 from benchmarks.beam_world import BANDS_HZ, FREQUENCY_HZ, Bridge, Damage, World, changed, turned
 from benchmarks.page import machine, write_part
 from calib.model import Array
-from calib.site_watch.day import Hours, day_of
+from calib.site_watch.day import Hours, Visits, day_of
 from calib.site_watch.verdicts import SiteVerdicts, result
-from calib.site_watch.watch import SiteWatch
+from calib.site_watch.visits import teach
+from calib.site_watch.watch import VISIT, SiteWatch
 
 GATEWAYS = {8: 3, 30: 5, 200: 10}
 LEARNED_DAYS = 240
@@ -297,6 +313,150 @@ def cost() -> str:
     return "\n".join(lines)
 
 
+# What becomes true in a year of a site of 8 sensors, from the day YEAR_BEGINS on: day, sensors, factor, axes.
+YEAR_BEGINS, YEAR_DAYS, VISIT_AFTER, U_VISIT = 240, 365, 3, 0.002
+EVENTS = (
+    (20, (2,), 0.99, (0, 1, 2)),
+    (80, (5,), 1.007, (2,)),
+    (140, (3, 4, 5), 0.99, (0, 1, 2)),
+    (200, (0,), 0.99, (1,)),
+)
+HURT = 270  # day of a damage at sensors 5 to 7
+
+
+def year(seed: int = 7) -> str:
+    """A year of a site: what a person is asked to do and does, against what is true.
+
+    A person visits the sensor that is told most clearly, VISIT_AFTER days after something new is told, of a gateway all
+    its sensors, and looks at the structure where that is told. A visit finds the truth with U_VISIT, and the sensor is
+    calibrated anew.
+    """
+    bridge = Bridge(seed, 8, GATEWAYS[8])
+    watch, random = SiteWatch(bridge.gateway, BANDS_HZ), np.random.default_rng(seed)
+    true, told_since, structure_seen = np.ones((8, 3)), -1, False
+    lines = ["| day | what is true | what the site says | what a person does and finds |", "| --- | --- | --- | --- |"]
+    for day in range(-YEAR_BEGINS, YEAR_DAYS):
+        for at, sensors, factor, axes in EVENTS:
+            if day == at:
+                true[np.ix_(sensors, axes)] *= factor
+                lines.append(f"| {day} | {_named(sensors, axes)} by {100 * (factor - 1):+.1f} % | | |")
+        if day == HURT:
+            bridge.damage = Damage(bridge.hour // 24, shape=0.05, modes=(0, 1, 3, 5, 7), sensors=(5, 6, 7))
+            lines.append(f"| {day} | the structure at sensors 5, 6, 7: shapes by 5 % | | |")
+        visits = Visits.unknown(np.zeros(8, dtype=bool))
+        found = result(watch) if day >= 0 else None
+        asked = [] if found is None else [*found.gateways] + [i for i in named(found) if i >= 0]
+        told_since = -1 if not asked else day if told_since < 0 else told_since
+        if found is not None and asked and day - told_since >= VISIT_AFTER:
+            who = _visited(found, bridge)
+            visits.there[who], visits.u[who] = True, U_VISIT
+            visits.found[who] = true[who] - 1.0 + U_VISIT * random.standard_normal((len(who), 3))
+            teach(watch, visits)
+            lines.append(f"| {day} | | {_said(found)} | visits {', '.join(map(str, who))}: {_outcome(watch, who)} |")
+            true[who], told_since = 1.0, -1
+        if found is not None and found.site.kind == "structure" and not structure_seen:
+            lines.append(f"| {day} | | {found.site.what} | looks at the structure |")
+            structure_seen = True
+        (hours,) = bridge.days(1)
+        for i in range(8):
+            for axis in range(3):
+                hours = hours if true[i, axis] == 1.0 else changed(hours, np.array([i]), true[i, axis], (axis,))
+        watch.update(day_of(hours, BANDS_HZ), visits)
+    return "\n".join(lines)
+
+
+def _named(sensors: tuple[int, ...], axes: tuple[int, ...]) -> str:
+    which = f"sensor {sensors[0]}" if len(sensors) == 1 else f"gateway of sensors {', '.join(map(str, sensors))}"
+    return f"{which}: {' '.join('xyz'[axis] for axis in axes)}"
+
+
+def _visited(found: SiteVerdicts, bridge: Bridge) -> list[int]:
+    """Whom a person visits: all sensors of a gateway that is told, or the sensors that are."""
+    if found.gateways:
+        return [int(i) for i in np.flatnonzero(np.isin(bridge.gateway, list(found.gateways)))]
+    strength = [one.statistic if one.kind in ALARMS else 0.0 for one in found.sensors]
+    return [int(np.argmax(strength))]
+
+
+def _said(found: SiteVerdicts) -> str:
+    told = [f"gateway {g}: {100 * one.size:+.1f} ± {100 * one.U:.1f} %" for g, one in found.gateways.items()]
+    for i, one in enumerate(found.sensors):
+        if one.kind in ALARMS:
+            size = f" {100 * one.size:+.1f} ± {100 * one.U:.1f} %" if np.isfinite(one.U) else ""
+            told.append(f"sensor {i}: {one.what}{size}")
+    return "; ".join(told)
+
+
+def _outcome(watch: SiteWatch, who: list[int]) -> str:
+    """What the visits found, and whether a suspicion was right."""
+    rows = [dict(zip(VISIT, row, strict=True)) for row in watch.visits.tolist()[-len(who) :]]
+    rows = [row for row in rows if int(row["sensor"]) in who and row["day"] == watch.day + 1]
+    told = []
+    for row in rows:
+        right = abs(row["size"] - row["found"]) <= 2.0 * np.hypot(row["u"], row["u_found"])
+        verdict = ("confirmed, " if right else "refuted, ") if row["suspected"] else ""
+        told.append(f"{verdict}{100 * row['found']:+.1f} %")
+    return "; ".join(told) or "nothing was said of their sensitivity"
+
+
+def kept() -> str:
+    """What the monitor keeps of a sensor and a year, and how long a year of a site takes it."""
+    lines = [
+        "| sensors | hour, bytes | day, bytes a sensor | a sensor and year, MB | a year of the site from days, s "
+        "| a batch of 100 hours, ms |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for sensors in GATEWAYS:
+        with TemporaryDirectory() as directory, closing(Sqlite(Path(directory) / "monitor.sqlite")) as engine:
+            row = _kept(sensors, engine)
+        lines.append(f"| {sensors} | {row} |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def _kept(sensors: int, engine: Sqlite) -> str:
+    """The row of a site in `kept`: two days of hours are kept, then days are copied until there are 365."""
+    bridge, first, database = Bridge(1, sensors, GATEWAYS[sensors]), 20_000, Database(engine)
+    bridge.hour = 24 * first
+    results = [one for hours in bridge.days(3) for one in _received(hours, bridge)]
+    batches = [results[k : k + 100] for k in range(0, len(results), 100)]
+    taken, _ = used(lambda: [database.add(batch) for batch in batches])
+    while close_day(database.query) is not None:
+        pass
+    ((hour,),) = database.query("SELECT avg(length(payload)) FROM watch_hour")
+    ((day,),) = database.query("SELECT avg(length(payload)) FROM watch_day WHERE stale = 0")
+    pages = database.query("SELECT sum(pgsize) FROM dbstat WHERE name LIKE '%watch_hour%'")
+    an_hour = pages[0][0] / len(results)  # with what the table takes beside the hours
+    rows = database.query("SELECT day, payload FROM watch_day WHERE stale = 0 ORDER BY day")
+    decoder = msgspec.msgpack.Decoder(DaySum)
+    for k in range(365):
+        one = decoder.decode(rows[k % len(rows)][1])
+        one.number = first + 10 + k
+        database.query(
+            "INSERT INTO watch_day VALUES ('bridge', :day, :last, 0, 0, :payload)",
+            day=one.number, last=24 * one.number + 23, payload=msgspec.msgpack.encode(one),
+        )  # fmt: skip
+    year, _ = used(lambda: seen(source_of(database.query, "bridge", closed=True)))
+    a_year = (365 * day / sensors + KEPT_DAYS * 24 * an_hour) / 1e6
+    return f"{hour:.0f} | {day / sensors:.0f} | {a_year:.1f} | {year:.1f} | {1e3 * taken / len(batches):.0f}"
+
+
+def _received(hours: Hours, bridge: Bridge) -> Iterable[Received]:
+    """The results of a day as the bus brings them."""
+    for h, hour in enumerate(hours.hour.tolist()):
+        for i in range(bridge.sensors):
+            fields = {
+                "sensor": f"s{i}", "sequence": int(hour) * bridge.sensors + i, "hour_utc_ns": int(hour) * 3600 * 10**9,
+                "t_utc_ns": int(hour + 1) * 3600 * 10**9, "duration_s": 3600.0, "samples": 360_000,
+                "temperature_degc": float(hours.temperature_degc[h, i]), "band_hz": BANDS_HZ.tolist(),
+                "noise_psd": hours.noise_psd[h, i].tolist(), "mean_mps2": [0.1, 0.2, 9.8], "u_main_pct": [0.2] * 3,
+                "band_power": hours.power[h, i].T.ravel().tolist(), "calibration_run_id": "0" * 32,
+                "cross_power": hours.cross[h, i].T.ravel().tolist(), "calibration_sequence": 1,
+            }  # fmt: skip
+            address = Address("bridge", f"g{bridge.gateway[i]}", f"s{i}", "watch")
+            yield Received("", address, fields["sequence"], fields, None)
+
+
 def _later(day, number: int):  # type: ignore[no-untyped-def]
     day = copy.copy(day)
     object.__setattr__(day, "number", number)
@@ -325,10 +485,16 @@ if __name__ == "__main__":
     parser.add_argument("--minutes", type=float, default=1e6)
     parser.add_argument("--worlds", action="store_true")
     parser.add_argument("--cost", action="store_true")
+    parser.add_argument("--kept", action="store_true")
+    parser.add_argument("--year", action="store_true")
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     if given.cost:
         name, text = "site-watch cost", f"`python -m benchmarks.site_watch --cost`, {machine()}.\n\n{cost()}"
+    elif given.kept:
+        name, text = "site-watch kept", f"`python -m benchmarks.site_watch --kept`, {machine()}.\n\n{kept()}"
+    elif given.year:
+        name, text = "site-watch year", f"`python -m benchmarks.site_watch --year`; {GATEWAYS[8]} gateways.\n\n{year()}"
     elif given.worlds:
         text = f"`python -m benchmarks.site_watch --worlds --cases {given.cases}`.\n\n{worlds(given.cases)}"
         name = "site-watch worlds"

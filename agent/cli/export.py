@@ -55,10 +55,14 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     metavar="LATITUDE LONGITUDE ELEVATION",
     help="Where the sensor is, in degrees and m, for StationXML.",
 )
+@click.option(
+    "--site-verdicts", type=_FILE, metavar="FILE",
+    help="What `fieldcal fleet watch --json FILE` tells: U then holds a change that is suspected of the device.",
+)  # fmt: skip
 @DATA_DIR
 def export(
     recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, device: str | None, rate_hz: float,
-    corrected: bool, place: tuple[float, float, float] | None, data_dir: Path | None,
+    corrected: bool, place: tuple[float, float, float] | None, site_verdicts: Path | None, data_dir: Path | None,
 ) -> int:  # fmt: skip
     """Write the samples of RECORDING (several: in the order given) with the times of their clock.
 
@@ -72,10 +76,12 @@ def export(
     """
     from agent.delivery.history import StoreError
     from agent.export.samples import ExportError, content_of
+    from agent.site_watch.source import WatchError
 
-    _check(to, mcap, place, data_dir, corrected=corrected)
+    _check(to, mcap, place, data_dir, site_verdicts, corrected=corrected)
     try:
         content = content_of(recordings, device)
+        _suspect(recordings, content, site_verdicts)
         if corrected:
             _check_axes(recordings, content)
         if to is not None and to.suffix == EPOCHS and place is not None:
@@ -90,7 +96,7 @@ def export(
         _write(recordings, content, to, mcap, rate_hz)
         for why, number in content.left_out.items():
             say(f"fieldcal export: {number} samples have no acceleration: {why}", err=True)
-    except (ExportError, StoreError, OSError) as error:
+    except (ExportError, StoreError, WatchError, OSError) as error:
         say(f"fieldcal export: {_worded(error, to or mcap)}", err=True)
         return 2
     return 0
@@ -103,8 +109,8 @@ def _worded(error: Exception, written: Path | None) -> str:
 
 
 def _check(
-    to: Path | None, mcap: Path | None, place: tuple[float, float, float] | None, data_dir: Path | None, *,
-    corrected: bool,
+    to: Path | None, mcap: Path | None, place: tuple[float, float, float] | None, data_dir: Path | None,
+    site_verdicts: Path | None, *, corrected: bool,
 ) -> None:  # fmt: skip
     """Raise click.UsageError for options that do not go together."""
     ending = None if to is None else to.suffix
@@ -120,6 +126,8 @@ def _check(
          "StationXML wants the place of the sensor; add --place LATITUDE LONGITUDE ELEVATION"),
         (place is not None and not epochs,
          f"--place belongs to StationXML; write a file that ends in {EPOCHS}, or remove --place"),
+        (site_verdicts is not None and ending not in (None, *NUMBERED),
+         f"{to} has no place for U; with --site-verdicts write {' or '.join(NUMBERED)}, or --mcap"),
         (data_dir is not None and not corrected,
          "--data-dir names the windows for --corrected; add that, or remove --data-dir"),
     )  # fmt: skip
@@ -142,6 +150,18 @@ def _write(
     if mcap is not None:
         count = write_plots(mcap, content, samples(recordings, content), rate_hz)
         say(f"{mcap}: {count} messages of {content.device} at {rate_hz:g} Hz")
+
+
+def _suspect(recordings: Sequence[Path], content: RecordedContent, verdicts: Path | None) -> None:
+    """Enlarge U by what is suspected of the device. Raises ExportError, WatchError."""
+    from agent.export.samples import start_of, suspect
+    from agent.site_watch.suspicion import suspicion_of
+
+    if verdicts is None:
+        return
+    suspect(content, suspicion_of(verdicts, content.device, start_of(recordings[0]).gateway))
+    told = "nothing is suspected, so U stays" if content.suspicion is None else content.suspicion.text
+    say(f"fieldcal export: {content.device}: {told}", err=True)
 
 
 def _check_axes(recordings: Sequence[Path], content: RecordedContent) -> None:

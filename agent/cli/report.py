@@ -28,7 +28,14 @@ if TYPE_CHECKING:
     metavar="NAME",
     help="The sensor to report, if the input has several. For results: the name on the page.",
 )
-def report(inputs: tuple[Path, ...], data_dir: Path | None, output: Path, unit: str | None, sensor: str | None) -> int:
+@click.option(
+    "--site-verdicts", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="What `fieldcal fleet watch --json FILE` tells: U then holds a change that is suspected of the sensor.",
+)  # fmt: skip
+def report(
+    inputs: tuple[Path, ...], data_dir: Path | None, output: Path, unit: str | None, sensor: str | None,
+    site_verdicts: Path | None,
+) -> int:  # fmt: skip
     """Make figures and one page of a calibration.
 
     INPUT is RESULT.json of `fieldcal calibrate --json -` (several are compared), or a recording (several are read one
@@ -44,11 +51,13 @@ def report(inputs: tuple[Path, ...], data_dir: Path | None, output: Path, unit: 
         return 1
     from agent.report.material import MaterialError, gather
     from agent.report.writing import write
+    from agent.site_watch.source import WatchError
 
     try:
         material = gather(inputs, sensor)
         _name_unit(material, unit)
-    except MaterialError as error:
+        _suspect(material, site_verdicts, sensor)
+    except (MaterialError, WatchError) as error:
         say(f"fieldcal report: {error}", err=True)
         return 2
     for notice in material.notices:
@@ -68,6 +77,20 @@ def _status(material: Material) -> int:
         for reason in result.reasons:
             say(f"refused: {reason}", err=True)
     return 3 if refused else 0
+
+
+def _suspect(material: Material, verdicts: Path | None, sensor: str | None) -> None:
+    """Enlarge U by what is suspected of the sensor. Raises MaterialError, WatchError."""
+    from agent.report.material import MaterialError
+    from agent.report.suspected import suspect
+    from agent.site_watch.suspicion import suspicion_of
+
+    if verdicts is None:
+        return
+    name = material.sensor or sensor
+    if not name:
+        raise MaterialError(f"--site-verdicts {verdicts}: the results name no sensor; add --sensor NAME")
+    suspect(material, suspicion_of(verdicts, name, material.facts.get("gateway", "")))
 
 
 def _name_unit(material: Material, unit: str | None) -> None:

@@ -22,6 +22,7 @@ from agent.core.snapshot import unpack
 from agent.core.stream import UNCOUNTED, DeviceStream
 from agent.export.smoothing import Smoothed
 from agent.recording.reading import RecordedStep, RecordingReader, first_event
+from agent.site_watch.suspicion import Suspicion
 from calib.model import Array
 from hw.block import SampleBlock
 
@@ -54,7 +55,8 @@ class ExportedSamples:
 class RecordedContent:
     """What recordings have of one device: `calibrations` in order of time, the first may be older than the files.
 
-    `smoothed`: the past by which its samples are corrected, if that was asked for. `left_out`: how many samples get no
+    `suspicion`: what is suspected of it by the other sensors of its site; U of the calibrations holds it. `smoothed`:
+    the past by which its samples are corrected, if that was asked for. `left_out`: how many samples get no
     acceleration by it, by the reason.
     """
 
@@ -64,7 +66,15 @@ class RecordedContent:
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     smoothed: Smoothed | None = None
+    suspicion: Suspicion | None = None
     left_out: Counter[str] = field(default_factory=Counter)
+
+
+def suspect(content: RecordedContent, suspicion: Suspicion | None) -> None:
+    """Enlarge U of the calibrations after a suspected change."""
+    content.suspicion = suspicion
+    if suspicion is not None:
+        content.calibrations = [suspicion.update(update) for update in content.calibrations]
 
 
 @contextmanager

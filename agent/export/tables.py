@@ -43,12 +43,26 @@ def write_csv(path: Path, content: RecordedContent, blocks: Iterable[ExportedSam
 
 
 def _about(content: RecordedContent) -> dict[str, str]:
-    """What a table of corrected samples says of itself."""
+    """What a table says of itself: of corrected samples, and of a sensor that its site suspects."""
     if content.smoothed is None:
-        return {}
+        return _suspected(content)
     told = {name: one_line(text) for name, text in content.smoothed.told.items()}
     runs = dict.fromkeys(update.made[0] for update in content.calibrations)
-    return {"device": one_line(content.device), **told, "runs of the calibrations": one_line(", ".join(runs))}
+    runs_told = one_line(", ".join(runs))
+    return {"device": one_line(content.device), **told, "runs of the calibrations": runs_told, **_suspected(content)}
+
+
+def _suspected(content: RecordedContent) -> dict[str, str]:
+    if content.suspicion is None:
+        return {}
+    told = {"suspected": one_line(content.suspicion.text)}
+    if content.calibrations:
+        newest = content.calibrations[-1]
+        U = newest.coverage_factor * np.array(newest.standard_uncertainty)[[0, 4, 8]]
+        told["U of Sxx, Syy, Szz, %"] = ", ".join(
+            f"{100.0 * U[i] / abs(newest.sensitivity[i][i]):.2g}" for i in range(3) if newest.sensitivity[i][i]
+        )
+    return told
 
 
 def cell(text: str) -> str:

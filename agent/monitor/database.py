@@ -6,12 +6,15 @@ import threading
 import time
 import zlib
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from agent.delivery.received import Received
-from agent.monitor.engines import LASTING, DatabaseEngine, QueryRunner
+from agent.monitor.engines import LASTING, DatabaseEngine, QueryRunner, Rows
 from agent.monitor.summaries import COUNTS, FULL_DAYS, SUMMARISED, merged, packed, split, summarise, unpacked
+from agent.monitor.watch_store import TABLES, WatchStore, forget_hours
+from agent.site_watch.hour import WatchHour
 from calib.model import PARAMETERS
 
 DAY_NS, HOUR_NS = 86_400_000_000_000, 3_600_000_000_000
@@ -38,7 +41,8 @@ _OF = "(SELECT id FROM sensor WHERE site = :site AND gateway = :gateway AND sens
 
 
 class _Row(NamedTuple):
-    """A result as it is kept. `gateway`: site, gateway, epoch; `detail`: what is kept where it has changed."""
+    """A result as it is kept. `gateway`: site, gateway, epoch; `detail`: what is kept where it has changed; `watch`:
+    the hour of a `watch` result, or why it has none."""
 
     gateway: tuple[str, str, str]
     sequence: int
@@ -49,12 +53,14 @@ class _Row(NamedTuple):
     part: str
     payload: bytes
     detail: bytes | None
+    watch: WatchHour | str | None
 
 
 class Database:
     """Results by sensor, in the order of their arrival. May be used by several threads.
 
-    `damaged`: the numbers of rows that were to be read and are not as they were written; they are left out.
+    `watch`: what is kept of sensors without a reference. `damaged`: the numbers of rows that were to be read and are
+    not as they were written; they are left out.
     `now_ns`: the present, UTC; a result that says to be of a later day is filed under today. Raises sqlite3.Error or
     DatabaseError where the engine cannot be used.
     """
@@ -64,13 +70,14 @@ class Database:
     ) -> None:
         self._engine, self._full_days, self._now_ns = engine, full_days, now_ns
         self.damaged: set[int] = set()
+        self.watch = WatchStore(now_ns)
         self._mutex = threading.Lock()
         self._sensors: dict[tuple[str, str, str], int] = {}
         self._days: set[int] = set()
         self._details: dict[tuple[int, str], tuple[int, bytes]] = {}  # the last one of each sensor, with its day
         columns = {"number": engine.NUMBER, "bytes": engine.BYTES, "partitioned": engine.PARTITIONED}
         with engine.transaction() as run:
-            engine.make_tables(run, [statement.format(**columns) for statement in _TABLES])
+            engine.make_tables(run, [statement.format(**columns) for statement in _TABLES + TABLES])
 
     def add(self, results: Sequence[Received]) -> None:
         """Keep results, all of them or none, in one transaction. One that is there already stays as it is."""
@@ -78,8 +85,9 @@ class Database:
             rows = [self._row(result) for result in results]
             with self._engine.transaction() as run:
                 self._engine.writes(run)
-                details = self._insert(run, rows)
+                details, left_out = self._insert(run, rows)
             self._details |= details
+            self.watch.left_out += left_out
 
     def _row(self, result: Received) -> _Row:
         a, fields, now_ns = result.address, result.fields, self._now_ns()
@@ -95,14 +103,18 @@ class Database:
             gateway=(a.site, a.gateway, result.epoch), sequence=result.sequence,
             day=self._day(t_utc_ns) if a.what in SUMMARISED else LASTING, hour=min(t_utc_ns, now_ns) // HOUR_NS,
             sensor=self._sensor(a.site, a.gateway, a.sensor), what=a.what, part=part.get(a.what, ""),
-            payload=packed(short), detail=detail,
+            payload=packed(short), detail=detail, watch=self.watch.hour_of(fields) if a.what == "watch" else None,
         )  # fmt: skip
 
-    def _insert(self, run: QueryRunner, rows: Sequence[_Row]) -> dict[tuple[int, str], tuple[int, bytes]]:
-        """Write the rows, and what is the newest after them; returns the last detail of each sensor, with its day."""
+    def _insert(
+        self, run: QueryRunner, rows: Sequence[_Row]
+    ) -> tuple[dict[tuple[int, str], tuple[int, bytes]], Counter[str]]:
+        """Write the rows, and what is the newest after them; returns the last detail of each sensor, with its day, and
+        which hours were left out."""
         details: dict[tuple[int, str], tuple[int, bytes]] = {}
         newest: dict[tuple[int, str, str], int] = {}
         followed: dict[tuple[str, str, str], tuple[int, int]] = {}
+        left_out: Counter[str] = Counter()
         for row in rows:
             place = row.sensor, row.what
             same = row.detail is not None and details.get(place, self._details.get(place)) == (row.day, row.detail)
@@ -118,6 +130,10 @@ class Database:
             ((number,),) = added
             if row.detail is not None:
                 details[place] = row.day, row.detail
+            if row.watch is not None:
+                hour = row.watch
+                told = hour if isinstance(hour, str) else self.watch.keep(run, row.gateway[0], row.sensor, hour)
+                left_out.update([told] if told else [])
             newest[row.sensor, row.what, row.part] = number
             followed[row.gateway] = max(row.sequence, followed.get(row.gateway, (0, 0))[0]), number
         for (sensor, what, part), number in newest.items():
@@ -134,7 +150,7 @@ class Database:
                 " ELSE followed.sequence END",
                 site=site, gateway=gateway, epoch=epoch, sequence=sequence, number=number,
             )  # fmt: skip
-        return details
+        return details, left_out
 
     def last_sequence(self) -> dict[str, int]:
         """The last result of each gateway and epoch, as Consumer takes it: of one gateway the newest epoch last."""
@@ -230,9 +246,17 @@ class Database:
             found.append({"t_utc_ns": (hour + 1) * HOUR_NS, "status": status} | dict(zip(COUNTS, counts, strict=True)))
         return found
 
-    def summarise(self) -> bool:
-        """Summarise one day of one sensor, or drop a day of which all are summarised; False where there is none."""
+    def query(self, sql: str, /, **values: object) -> Rows:
+        """Run one query by itself."""
         with self._engine.transaction() as run:
+            return run(sql, **values)
+
+    def summarise(self) -> bool:
+        """Summarise one day of one sensor, or drop a day of which all are summarised, or hours of the watch that are
+        old; False where there is none."""
+        with self._engine.transaction() as run:
+            if forget_hours(run):
+                return True
             first = self._now_ns() // DAY_NS - self._full_days
             rows = run("SELECT day, done FROM day WHERE day < :first ORDER BY day LIMIT 1", first=first)
             if not rows:

@@ -19,6 +19,7 @@ import msgspec
 
 from agent.core.events import RESULTS
 from agent.delivery.keys import CHUNK, Address
+from agent.site_watch.suspicion import Suspicion
 from calib.model import PARAMETERS
 
 NEEDS_A_PERSON = ("INVALID", "HELD", "UNCALIBRATED")
@@ -54,7 +55,9 @@ IN_TURNS = (
 RUN_SHOWN = 12  # characters of the id of a run
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.e+-]*")
 
-Kind = Literal["drifting", "changed", "held", "doubled", "no data", "silent", "retired", "uncalibrated", "sound"]
+Kind = Literal[
+    "drifting", "changed", "held", "doubled", "no data", "silent", "retired", "uncalibrated", "suspected", "sound"
+]  # fmt: skip
 
 SHOWN = {"status", "calibration", "good window"}  # a sensor of which none is known, and no drift, has no row
 
@@ -93,6 +96,7 @@ class Fleet:
         self._in_turns: dict[tuple[str, str], tuple[str, ...]] = {}
         self._mixed_utc_ns: dict[tuple[str, str], int] = {}  # since when gateways are in one of the two
         self._gateways: set[tuple[str, str]] = set()
+        self._suspected: dict[Place, Suspicion] = {}
         self._changed: dict[Place, int] = {}  # `version` at the last change of each sensor
         self._made: dict[Place, dict[str, Any]] = {}  # the row of each sensor
         self._events: dict[tuple[Place, str, str], dict[str, Any]] = {}  # the newest last
@@ -234,6 +238,25 @@ class Fleet:
             self._alarms.clear()
             return found
 
+    def set_suspected(
+        self, site: str, found: Mapping[tuple[str, str], Suspicion], t_utc_ns: int, *, fresh: bool = True
+    ) -> None:
+        """What the site tells of its sensors (by gateway and name), in the place of what it told before.
+
+        `fresh`: people are told of a sensor that was not suspected before.
+        """
+        with self._mutex:
+            before = {place for place in self._suspected if place[0] == site}
+            now = {(site, *names): one for names, one in found.items()}
+            if any(self._suspected.get(place) != now.get(place) for place in before | now.keys()):
+                self._suspected = {p: one for p, one in self._suspected.items() if p[0] != site} | now
+                self.version += 1
+                for place in before | now.keys():
+                    if place in self._newest:
+                        self._touch(place)
+        for place in sorted(now.keys() - before):
+            self.note(*place, "watch", t_utc_ns, f"suspected: {now[place].text}", alarm=fresh)
+
     def set_alive(self, site: str, gateway: str, alive: bool) -> None:
         """Whether the gateway is on the bus."""
         with self._mutex:
@@ -304,8 +327,10 @@ class Fleet:
             doubled = gateway in self._mixed_utc_ns
             of = {"heard_utc_ns": self._heard[place].at_ns, "changed": self._changed[place]}
             retired = not self._retired.isdisjoint(("/".join(gateway), "/".join(place)))
-            state = self._state_of(gateway)
-            row = _row(place, self._newest[place], state, heard=heard, doubled=doubled, retired=retired)
+            row = _row(
+                place, self._newest[place], self._state_of(gateway), self._suspected.get(place), heard=heard,
+                doubled=doubled, retired=retired,
+            )  # fmt: skip
             self._made[place] = row | of
         return self._made[place]
 
@@ -393,10 +418,12 @@ def _verdicts(newest: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def kind_of(
-    verdicts: Collection[str], status: str, *, heard: bool, doubled: bool = False, retired: bool = False
-) -> Kind:
+    verdicts: Collection[str], status: str, *, heard: bool, doubled: bool = False, retired: bool = False,
+    suspected: bool = False,
+) -> Kind:  # fmt: skip
     """The kind of a sensor: what it counts as on the page. `verdicts`: "drifting" or "stepped"; `doubled`: two gateways
-    have the name of its own, so nobody knows whose results these are; `retired`: it was taken down.
+    have the name of its own, so nobody knows whose results these are; `retired`: it was taken down; `suspected`: by the
+    other sensors of its site.
 
     Held windows are what shows a step, so a sensor that is held and has stepped is held. One whose step was adopted has
     changed: of a drift, too, a part may be told as a step (trends.change_in).
@@ -409,21 +436,17 @@ def kind_of(
         return "drifting"
     if verdicts and status != "HELD":
         return "changed"
-    return _OF_STATUS.get(status, "uncalibrated")
+    kind = _OF_STATUS.get(status, "uncalibrated")
+    return "suspected" if suspected and kind == "sound" else kind
 
 
 _OF_STATUS: dict[str, Kind] = {"VALID": "sound", "RECALIBRATING": "sound", "HELD": "held", "INVALID": "no data"}
 
 
 def _row(
-    place: Place,
-    newest: dict[str, dict[str, Any]],
-    gateway_state: str,
-    *,
-    heard: bool,
-    doubled: bool,
-    retired: bool,
-) -> dict[str, Any]:
+    place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, suspicion: Suspicion | None, *, heard: bool,
+    doubled: bool, retired: bool,
+) -> dict[str, Any]:  # fmt: skip
     status, calibration = newest.get("status", {}), newest.get("calibration", {})
     verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
     u_pct, u_axis = _largest_u(calibration)
@@ -440,11 +463,20 @@ def _row(
         why.append(f"no result for {SILENT_INTERVALS} intervals")
     if doubled:
         why.append("two gateways have one name")
+    if suspicion is not None:
+        why.append(f"suspected: {suspicion.text}")
     return {
         "site": place[0],
         "gateway": place[1],
         "sensor": place[2],
-        "kind": kind_of(told, status.get("status", ""), heard=heard, doubled=doubled, retired=retired),
+        "kind": kind_of(
+            told,
+            status.get("status", ""),
+            heard=heard,
+            doubled=doubled,
+            retired=retired,
+            suspected=suspicion is not None,
+        ),
         "status": status.get("status", ""),
         "status_utc_ns": status.get("t_utc_ns"),
         "reason": clipped(status.get("reason", "")),
@@ -453,6 +485,7 @@ def _row(
         "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
         "u_pct": u_pct,
         "u_axis": u_axis,
+        "suspected": None if suspicion is None else _suspected(suspicion, calibration),
         "band_hz": calibration.get("valid_band_hz", []),
         "calibration_utc_ns": calibration.get("t_utc_ns"),
         "reference": clipped(reference),
@@ -464,6 +497,16 @@ def _row(
         "verified": bool(newest) and all(fields.get("signed_by") for fields in newest.values()),
         "why": "; ".join(clipped(reason) for reason in why),
     }
+
+
+def _suspected(suspicion: Suspicion, calibration: Mapping[str, Any]) -> dict[str, Any]:
+    """What is suspected, with `u_pct`: the largest U (k = 2) of a main sensitivity enlarged by it, in %; None where no
+    calibration is known."""
+    enlarged = [
+        suspicion.enlarged_u_pct(pct, PARAMETERS[i][1]) for i, pct in _main_u(calibration).items()
+    ] if calibration else []  # fmt: skip
+    told: dict[str, Any] = msgspec.to_builtins(suspicion)
+    return told | {"u_pct": max(enlarged, default=None)}
 
 
 def dated(reference: str) -> tuple[str, int | None]:
@@ -481,9 +524,14 @@ def _largest_u(calibration: Mapping[str, Any]) -> tuple[float | None, str]:
     """The largest U (k = 2) of a main sensitivity, in % of it, and which one it is; None and "" where none is known."""
     if not calibration:
         return None, ""
+    return max(((pct, PARAMETERS[i]) for i, pct in _main_u(calibration).items()), default=(None, ""))
+
+
+def _main_u(calibration: Mapping[str, Any]) -> dict[int, float]:
+    """U (k = 2) of each main sensitivity in % of it, by its index in PARAMETERS, where it is known."""
     values, u = calibration["sensitivity"], calibration["standard_uncertainty"]
-    found = [(200.0 * u[i] / abs(s), PARAMETERS[i]) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None]
-    return max((each for each in found if math.isfinite(each[0])), default=(None, ""))
+    found = {i: 200.0 * u[i] / abs(s) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None}
+    return {i: pct for i, pct in found.items() if math.isfinite(pct)}
 
 
 def _gateway_row(

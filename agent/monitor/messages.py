@@ -21,7 +21,7 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066
 
 
 class Notice(msgspec.Struct, frozen=True):
-    """One thing that a person should know. `kind`: status, drift, gateway or certificate; `subject`: of which."""
+    """One thing to know. `kind`: status, drift, watch, gateway or certificate; `subject`: of which."""
 
     kind: str
     subject: str

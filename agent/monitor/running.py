@@ -29,6 +29,7 @@ from agent.monitor.notices import FleetWatch, NoticeSender
 from agent.monitor.plan import Plans
 from agent.monitor.server import application
 from agent.monitor.settings import MonitorSettings
+from agent.monitor.site_watching import SiteWatching
 from agent.monitor.summaries import Summariser
 
 PROXIES = ("127.0.0.1", "::1")  # whose X-Forwarded-For is believed with --behind-proxy
@@ -85,11 +86,16 @@ def serve(listening: socket.socket, data_dir: Path, bus: BusAccess, web: Web, se
         stack.callback(Summariser(database.summarise).close)
         following = Following(bus.endpoints, bus.tls, database, fleet, bus.keys)
         stack.callback(following.close)
+        watching = SiteWatching(database, fleet)
+        watching.start()
+        stack.callback(watching.close)
         notifier = None
         if settings.notices is not None:
             notifier = NoticeSender(FleetWatch(fleet, settings.notices, _certificates(bus, web)), settings.notices)
             stack.callback(notifier.close)
-        app = application(database, fleet, following, access, forwarding, live, stopping, plans, web.names, notifier)
+        app = application(
+            database, fleet, following, access, forwarding, live, stopping, plans, watching, web.names, notifier
+        )
         server, bounded = web_server(app, listening, web, stopping)
         # The server raises the signal again that has ended it; SIGTERM would then end the process before what is below.
         signal.signal(signal.SIGTERM, signal.default_int_handler)

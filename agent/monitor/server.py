@@ -33,6 +33,7 @@ from agent.monitor.live import Live
 from agent.monitor.login import Access
 from agent.monitor.notices import NoticeSender
 from agent.monitor.plan import Plans
+from agent.monitor.site_watching import SiteWatching
 from agent.monitor.trends import Trends
 from agent.terminal.text import no_formula
 
@@ -63,6 +64,7 @@ def application(
     live: Live,
     stopping: threading.Event,
     plans: Plans,
+    watching: SiteWatching,
     names: Sequence[str] = (),
     notifier: NoticeSender | None = None,
 ) -> ASGIApp:
@@ -71,7 +73,7 @@ def application(
     `stopping` ends the streams, which a browser would keep open for ever. `names`: host names by which browsers reach
     this server, besides localhost and IP addresses. `notifier`: its fault is shown.
     """
-    data = _Data(database, fleet, following, stopping, notifier)
+    data = _Data(database, fleet, following, stopping, watching, notifier)
     app = Starlette(
         routes=[
             Route("/api/fleet", access.reading(data.sensors)),
@@ -93,6 +95,8 @@ def application(
             Route("/advice.csv", access.reading(data.advice_csv)),
             Route("/api/bench", access.reading(data.bench)),
             Route("/bench.csv", access.reading(data.bench_csv)),
+            Route("/api/watch", access.reading(data.watch)),
+            Route("/watch.csv", access.reading(data.watch_csv)),
             Route("/api/events", access.reading(data.events)),
             Route("/events.csv", access.reading(data.events_csv)),
             Route("/api/me", access.me),
@@ -123,10 +127,10 @@ class _Data:
 
     def __init__(
         self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event,
-        notifier: NoticeSender | None,
+        watching: SiteWatching, notifier: NoticeSender | None,
     ) -> None:  # fmt: skip
         self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
-        self._notifier = notifier
+        self._watching, self._notifier = watching, notifier
         self._advisor, self._trends = Advisor(database, fleet), Trends(database, fleet)
         self._listeners: set[object] = set()
 
@@ -136,6 +140,7 @@ class _Data:
         bus["notices"] = self._notifier.fault if self._notifier is not None else ""
         fleet.look()
         return _json({"version": fleet.version, "now_utc_ns": time.time_ns(), "sensors": fleet.rows(_since(request)),
+        "sites": self._watching.changed_sites(),
                       "gateways": fleet.gateways(following.refused), "bus": bus})  # fmt: skip
 
     def trends(self, request: Request) -> Response:
@@ -152,6 +157,18 @@ class _Data:
 
     def events_csv(self, _: Request) -> Response:
         return _csv("events.csv", self._fleet.events())
+
+    def watch(self, request: Request) -> Response:
+        """What is told of a site as a whole; null where nothing is."""
+        return _json(self._watching.told.get(request.query_params.get("site", "")))
+
+    def watch_csv(self, _: Request) -> Response:
+        rows = [
+            {"site": site, "until": told["until"], **one, "suspected": (one["suspected"] or {}).get("text", "")}
+            for site, told in sorted(self._watching.told.items())
+            for one in told["sensors"]
+        ]
+        return _csv("watch.csv", rows)
 
     def bench(self, request: Request) -> Response:
         """All sessions of `fieldcal bench`, and the guide of the one that is asked for."""

@@ -67,7 +67,9 @@ class Email(Section):
 
 
 class Notices(Section):
-    """Who is told of drift verdicts, a status that needs a person, silent gateways and certificates that end."""
+    """Who is told of drift verdicts, of what a site suspects, of a status that needs a person, of silent gateways and
+    of certificates that end.
+    """
 
     silent_s: Annotated[
         float, Field(ge=1, le=1e7, description="a gateway is told after it was off the bus for so long")

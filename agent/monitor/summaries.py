@@ -20,7 +20,8 @@ from agent.monitor.engines import LASTING, DatabaseError, QueryRunner
 
 FULL_DAYS = 7  # days for which every result is kept in full
 # Results of these kinds come by schedule. All others (status, drift verdicts, kinds of a newer version) stay in full.
-SUMMARISED = ("calibration", "estimate", "window", "clock")
+# Of `watch` nothing is counted: its hours are kept apart (agent.monitor.watch_store).
+SUMMARISED = ("calibration", "estimate", "window", "clock", "watch")
 COUNTS = {
     "calibrations": "what = 'calibration'",
     "estimates": "what = 'estimate'",

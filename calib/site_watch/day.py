@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 
@@ -35,7 +36,8 @@ class Hours:
     """Hourly results of n sensors in B bands; NaN where there is none.
 
     `hour` (H,): hours since 1970 in UTC. `power`, `cross` (H, n, B, 3): mean squares of x, y, z and real cross
-    powers xy, xz, yz, (m/s²)². `noise_psd` (H, n, 3), (m/s²)²/Hz. `temperature_degc` (H, n).
+    powers xy, xz, yz, (m/s²)². `noise_psd` (H, n, 3), (m/s²)²/Hz. `temperature_degc` (H, n). `mean_mps2` (H, n, 3):
+    mean of the outputs, None where no result tells it.
     """
 
     hour: Array
@@ -43,13 +45,15 @@ class Hours:
     cross: Array
     noise_psd: Array
     temperature_degc: Array
+    mean_mps2: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Day:
     """One day. `value`, `u` (n, B, 6): the channels with the standard uncertainty that their noise gives; NaN and inf
     where a channel does not count. `level` (B, 3): log amplitude of the level. `log_noise` (n, 3): half the log of the
-    noise floor. `temperature_degc`: the median of all sensors; NaN where none tells one.
+    noise floor. `temperature_degc`: the median of all sensors; NaN where none tells one. `mean_mps2` (n, 3): the median
+    of the hours.
     """
 
     number: int
@@ -58,6 +62,25 @@ class Day:
     level: Array
     log_noise: Array
     temperature_degc: float
+    mean_mps2: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visits:
+    """Sensors that got another calibration on a day, by a bench, a visit or a reference.
+
+    `there` (n,): which. `found` (n, 3): relative change of the sensitivity of x, y, z since the calibration before,
+    which was found then; NaN where it is not known. `u` (n,): standard uncertainty of it.
+    """
+
+    there: NDArray[np.bool_]
+    found: Array
+    u: Array
+
+    @classmethod
+    def unknown(cls, there: NDArray[np.bool_]) -> Visits:
+        """Visits of which is not known what they found."""
+        return cls(there, np.full((len(there), 3), np.nan), np.full(len(there), np.inf))
 
 
 def day_of(hours: Hours, band_hz: Array) -> Day:
@@ -88,6 +111,7 @@ def day_of(hours: Hours, band_hz: Array) -> Day:
         level,
         0.5 * np.log(_positive(_median(hours.noise_psd))),
         float(np.median(temperatures)) if temperatures.size else np.nan,
+        None if hours.mean_mps2 is None else _median(hours.mean_mps2),
     )
 
 

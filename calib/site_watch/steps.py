@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 
@@ -63,7 +64,7 @@ class Steps:
         self.days += there
         self._solve()
 
-    def restart(self, channels: Array) -> None:
+    def restart(self, channels: NDArray[np.bool_]) -> None:
         """Forget these channels (a mask): a visit has changed what they indicate."""
         for each in (self.A, self.b, self.squares, self.days, *self.before):
             each[..., channels] = 0.0

@@ -7,16 +7,18 @@ sensors, directions, gateways, noise floors and times share one rate of false al
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.distributions import NORMAL, student_quantile
 from calib.model import Array
-from calib.site_watch.steps import PRIOR_DEGREES, TERMS
+from calib.site_watch.scatter import Blocks
+from calib.site_watch.steps import PRIOR_DEGREES, TERMS, Steps
 from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, jointly, median
-from calib.site_watch.watch import SiteWatch, pooled
+from calib.site_watch.watch import VISIT, SiteWatch, pooled
+from calib.site_watch.witnesses import Witness, gravity, noise
 
 FALSE_ALARMS_PER_YEAR = 0.5  # of a whole site, at most, where the model of the scatter holds
 LOOKS_PER_YEAR = 1000.0  # independent looks of a test: a new one each day for steps of a few days, fewer for older ones
@@ -31,6 +33,7 @@ FEWEST_BANDS = 3  # for bands to be called alike
 NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
          "turn about x", "turn about y", "turn about z")  # fmt: skip
 MONTH_DAYS = 30  # after a change, of which the least detectable one is told
+VISITS_DAYS = 400  # for which what a visit found says how far all sensors have changed alike
 LONGEST_DAYS = 365  # of the norm, over which the walk counts
 LEAST_VARIANCE = 0.2  # of a channel's variance, that a step leaves
 EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told apart (2 standard deviations)
@@ -41,9 +44,11 @@ class SensorVerdict:
     """A verdict of a sensor or gateway.
 
     `kind`: none, learning, sensitivity, turn, noise, structure, sensor or structure, gateway. `what`: in words.
-    `size`, `U`: relative change of the sensitivity (of the amplitude of the noise), or angle in rad; expanded by
-    COVERAGE. `since`, `earliest`, `latest`: days since 1970. `statistic`: size over its standard uncertainty, or a
-    normal equivalent.
+    `size`, `U`: change of the log of the sensitivity (relative change of the amplitude of the noise), or angle in
+    rad; expanded by COVERAGE. `since`, `earliest`, `latest`: days since 1970. `statistic`: size over its standard
+    uncertainty, or a normal equivalent. `direction`: index in calib.site_watch.together.DIRECTIONS of a sensitivity
+    or turn; -1 for others.
+    `witnesses`: of a sensitivity or turn, the structure first.
     """
 
     kind: str
@@ -54,6 +59,8 @@ class SensorVerdict:
     earliest: int = -1
     latest: int = -1
     statistic: float = 0.0
+    direction: int = -1
+    witnesses: tuple[Witness, ...] = ()
 
 
 NOTHING = SensorVerdict("none")
@@ -66,8 +73,8 @@ class SiteVerdicts:
     `sensors` (n), `gateways` {number: verdict}, `site`. `least_detectable` (n, 3): relative change of the
     sensitivity of x, y, z that is found 30 days after it in half of the cases. `days` (n,): days that teach the
     norm. `seen_degc` (n, 2): range of temperature in the norm. `outside`: today's temperature is beyond what the
-    sensor's norm has seen. `common`: change that all sensors share, against those beside a reference; None without
-    such. `hidden`: a common change below this size is not seen (relative).
+    sensor's norm has seen. `common`: change that all sensors share, against those beside a reference, or else by what
+    visits found; None without such. `hidden`: a common change below this size is not seen (relative).
     """
 
     day: int
@@ -121,16 +128,18 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
     site, common, least = NOTHING, None, np.full((n, 3), np.inf)
     tests = examined(watch)
     if tests is not None:
-        noise = _noise(watch, limit)
+        floors = _noise(watch, limit)
         for i in range(n):
             if sensors[i].kind == "none" and not anchored[i]:
-                sensors[i] = _sensor(tests, i, limit, noise[i])
+                sensors[i] = _sensor(tests, i, limit, floors[i])
         gateways = _gateways(watch, tests, sensors, limit)
         site = _structure(tests, sensors)
         if known_u is not None and anchored.any():
             common = _common_change(tests, known_u[anchored], anchored)
+        sensors = [_witnessed(watch, i, told) for i, told in enumerate(sensors)]
         month = int(np.argmin([abs(watch.day - begin + 1 - MONTH_DAYS) for begin in tests.begins]))
         least = limit * tests.joint.u[month, :, :3]
+    common = common or _common_by_visits(watch)
     outside = (watch.degc < watch.seen_degc[:, 0]) | (watch.degc > watch.seen_degc[:, 1])
     hidden = common.U if common is not None else np.inf
     return SiteVerdicts(
@@ -152,7 +161,7 @@ def examined(watch: SiteWatch) -> Tests | None:
     ages = np.array([watch.day - begins[k] + 1 for k in which], dtype=float)
     before = np.minimum([begins[k] - begins[0] for k in which], LONGEST_DAYS)
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
-    inflation = MISFIT**2 * watch.days_scatter.over(watch.day, [begins[k] for k in which])
+    inflation = MISFIT**2 * watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
     joint = jointly(size, information, watch.G, inflation, walk)
     apart = _apart(joint, watch.G)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
@@ -203,21 +212,39 @@ def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorV
         kind = "sensitivity" if direction <= ALL else "turn"
         kind = kind if tests.bands[best, i] >= FEWEST_BANDS else "sensor or structure"
         size, u = tests.joint.size[best, i, direction], tests.joint.u[best, i, direction]
-        return SensorVerdict(kind, NAMES[direction], float(size), COVERAGE * float(u), *dates, z)
+        return SensorVerdict(kind, NAMES[direction], float(size), COVERAGE * float(u), *dates, z, direction)
     return noise
+
+
+def _witnessed(watch: SiteWatch, i: int, told: SensorVerdict) -> SensorVerdict:
+    """The verdict with what each witness says of it at its date."""
+    if told.kind not in ("sensitivity", "turn"):
+        return told
+    k, u = watch.means.begins.index(told.since), told.U / COVERAGE
+    step, u_step = (part[0, i] for part in _followed(watch, watch.means, watch.mean_scatter, [k]))
+    floor, u_floor = (part[0, i] for part in _followed(watch, watch.noise, watch.noise_scatter, [k]))
+    mean = watch.means.beta[0].reshape(-1, 3)[i]
+    others = gravity(told.direction, told.size, u, mean, step, u_step), noise(told.direction, floor, u_floor)
+    return replace(told, witnesses=(Witness("structure", "agrees", told.size, u), *others))
+
+
+def _followed(watch: SiteWatch, steps: Steps, scatter: Blocks, which: list[int]) -> tuple[Array, Array]:
+    """Steps of noise floors or means at these begins, (k, n, 3), and their u; inf where too few days tell of one."""
+    shape = watch.shape[0], 3
+    size, information, since = (part.reshape(-1, *shape) for part in steps.step(which))
+    days = steps.days.reshape(shape)
+    counts = (since >= FEWEST_SINCE) & (days - since >= FEWEST_DAYS) & (information > 0.0)
+    without = _without(pooled(*steps.rest(), shape), size, information, days)
+    grown = scatter.over(watch.day, [steps.begins[k] for k in which])
+    return size, np.where(counts, np.sqrt(without * grown / np.where(counts, information, 1.0)), np.inf)
 
 
 def _noise(watch: SiteWatch, limit: float) -> list[SensorVerdict]:
     """Has the noise floor of an output changed? For each sensor."""
     steps, shape = watch.noise, (watch.shape[0], 3)
     which = [k for k, begin in enumerate(steps.begins) if watch.day - begin + 1 >= FEWEST_SINCE]
-    size, information, since = (part.reshape(-1, *shape) for part in steps.step(which))
-    days = steps.days.reshape(shape)
-    counts = (since >= FEWEST_SINCE) & (days - since >= FEWEST_DAYS) & (information > 0.0)
-    without = _without(pooled(*steps.rest(), shape), size, information, days)
-    grown = watch.noise_scatter.over(watch.day, [steps.begins[k] for k in which])
-    u = np.sqrt(without * grown / np.where(counts, information, 1.0))
-    z = np.where(counts, np.abs(size) / u, 0.0)
+    size, u = _followed(watch, steps, watch.noise_scatter, which)
+    days, z = steps.days.reshape(shape), np.abs(size) / u
     told = []
     for i in range(shape[0]):
         k, axis = np.unravel_index(int(np.argmax(z[:, i])), (len(which), 3))
@@ -300,3 +327,19 @@ def _common_change(tests: Tests, known_u: Array, anchored: Array) -> SensorVerdi
     return SensorVerdict(
         "common", "all sensors without a reference", float(mean[best]), COVERAGE * float(u_mean[best]), *dates, z
     )
+
+
+def _common_by_visits(watch: SiteWatch) -> SensorVerdict | None:
+    """What all sensors share, from visits: what each found, without what the watch told of this sensor alone.
+
+    Visits may rest on one reference, so their mean has at least the uncertainty of the best of them.
+    """
+    recent = watch.visits[watch.visits[:, VISIT.index("day")] > watch.day - VISITS_DAYS]
+    if not len(recent):
+        return None
+    _, _, _, size, u, found, u_found = recent.T
+    weight = 1.0 / (u**2 + u_found**2)
+    mean = float(np.sum(weight * (found - size)) / weight.sum())
+    u_mean = max(float(weight.sum()) ** -0.5, float(u_found.min()))
+    what = f"all sensors, by {len(recent)} visits in {VISITS_DAYS} days"
+    return SensorVerdict("common", what, mean, COVERAGE * u_mean, statistic=abs(mean) / u_mean)

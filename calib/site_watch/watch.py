@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.site_watch.day import Day
+from calib.site_watch.day import Day, Visits
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import HUBER, PRIOR_DEGREES, TERMS, Steps
 from calib.site_watch.together import DIRECTIONS, biweight, design, scores
@@ -22,6 +22,13 @@ FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, o
 FEWEST_SENSORS = 3  # with a band, for its common level to be taken out
 CHANNELS = 6
 WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
+U_MEAN_MPS2 = 0.001  # of the mean of a day; only ratios of weights depend on it
+# The prior of the coefficients of the mean, in m/s² where steps.PRIOR has log amplitudes, is ten times as wide.
+MEAN_PRIOR_SCALE = 0.01
+# Of a visit: which sensor, when; whether its sensitivity was suspected; the change that the watch told (0 where it told
+# none) and what was found, as logarithms, each with its standard uncertainty.
+VISIT = "sensor", "day", "suspected", "size", "u", "found", "u_found"
+PRIOR_VISITS = 10.0  # suspicions that are worth what the scatter says of itself
 
 
 class SiteWatch:
@@ -33,27 +40,29 @@ class SiteWatch:
         self.day = -1
         self.steps = Steps(int(np.prod(self.shape)))
         self.noise = Steps(self.shape[0] * 3)
+        self.means = Steps(self.shape[0] * 3, MEAN_PRIOR_SCALE)
         self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)))
         self.band_scatter = Blocks(self.shape, lags=(1, 7))
         self.noise_scatter = Blocks((self.shape[0], 3))
+        self.mean_scatter = Blocks((self.shape[0], 3))
+        self.visits = np.zeros((0, len(VISIT)))  # of each visit that taught something
         self.origin = np.full((self.shape[1], 3), np.nan)  # levels of the first day
         self.seen_degc = np.tile([np.inf, -np.inf], (self.shape[0], 1))
         self.degc = np.nan  # of the last day
         self.G = np.zeros((*self.shape, CHANNELS))
 
-    def update(self, day: Day, visited: Array | None = None) -> None:
-        """Take a day. `visited` (n,): sensors whose calibration changed in it; their norm begins anew after it.
+    def update(self, day: Day, visits: Visits | None = None) -> None:
+        """Take a day. `visits`: sensors whose calibration changed in it; their norm begins anew after it.
 
         Raises ValueError if the day is not later than the one before.
         """
         if day.number <= self.day:
             raise ValueError(f"day {day.number} comes after day {self.day}")
-        if visited is not None and np.any(visited):
-            self._restart(np.asarray(visited, dtype=bool))
+        visited = np.zeros(self.shape[0], dtype=bool) if visits is None else visits.there
+        if visited.any():
+            self._restart(visited)
         self.day, self.degc = day.number, day.temperature_degc
-        there = np.isfinite(day.value)
-        if visited is not None:
-            there &= ~np.asarray(visited, dtype=bool)[:, None, None]
+        there = np.isfinite(day.value) & ~visited[:, None, None]
         x = self._regressors(day)
         value = np.where(there, day.value, 0.0)
         weight = np.where(there, 1.0 / np.square(day.u), 0.0)
@@ -71,7 +80,10 @@ class SiteWatch:
         weight *= np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9))
         self.steps.update(day.number, x, value.ravel(), weight.ravel())
         self.days_scatter.remember(self.steps.begins)
-        self._noise(day)
+        self._follow(self.noise, self.noise_scatter, day.log_noise, 1.0, day)
+        untold = visited[:, None] if day.mean_mps2 is not None else True
+        mean = np.where(untold, np.nan, 0.0 if day.mean_mps2 is None else day.mean_mps2)
+        self._follow(self.means, self.mean_scatter, np.broadcast_to(mean, (self.shape[0], 3)), U_MEAN_MPS2, day)
         self._seen(there.sum(axis=(1, 2)) > 0)
         mean = self.steps.beta[0].reshape(self.shape)
         self.G = design(np.where(self.steps.days.reshape(self.shape) > 0, mean, np.nan), np.nan_to_num(self.origin))
@@ -87,6 +99,13 @@ class SiteWatch:
         week = (blocks.squares[WEEK] + PRIOR_DEGREES * blocks.inflation()[WEEK]) / enough
         return np.asarray(own * np.maximum(week, 1.0))
 
+    def taught(self) -> float:
+        """Factor of the variance of each test, at least 1, from the visits that looked at a suspicion."""
+        suspected = self.visits[self.visits[:, VISIT.index("suspected")] > 0.0]
+        _, _, _, size, u, found, u_found = suspected.T
+        squares = float(np.sum((size - found) ** 2 / (u**2 + u_found**2)))
+        return max((PRIOR_VISITS + squares) / (PRIOR_VISITS + len(suspected)), 1.0)
+
     def snapshot(self) -> dict[str, Any]:
         """All state as plain arrays, in dictionaries."""
         parts = {name: getattr(self, name).snapshot() for name in _PARTS}
@@ -98,15 +117,16 @@ class SiteWatch:
         """The watch of a snapshot."""
         watch = cls(told["gateway"], told["band_hz"])
         watch.day, watch.degc = int(told["day"]), float(told["degc"])
-        for name in ("origin", "seen_degc", "G"):
+        for name in ("origin", "seen_degc", "G", "visits"):
             setattr(watch, name, told[name].copy())
         for name in _PARTS:
             getattr(watch, name).load(told[name])
         return watch
 
-    def _restart(self, visited: Array) -> None:
+    def _restart(self, visited: NDArray[np.bool_]) -> None:
         channels = np.broadcast_to(visited[:, None, None], self.shape).ravel()
         self.steps.restart(channels)
+        self.means.restart(np.repeat(visited, 3))
         self.seen_degc[visited] = np.inf, -np.inf
 
     def _regressors(self, day: Day) -> Array:
@@ -134,21 +154,21 @@ class SiteWatch:
         known = squares > 0.0
         self.days_scatter.update(score / np.sqrt(np.where(known, squares, 1.0)), known)
 
-    def _noise(self, day: Day) -> None:
-        """The noise floors are followed as the channels are, without a level."""
-        value = day.log_noise.ravel()
+    def _follow(self, steps: Steps, scatter: Blocks, told: Array, u: float, day: Day) -> None:
+        """Noise floors and means (n, 3) are followed as the channels are, without a level; `u`: of one of them."""
+        value = told.ravel()
         there = np.isfinite(value)
         x = np.zeros((TERMS, len(value)))
         x[0] = 1.0
         x[1] = np.nan_to_num((day.temperature_degc - ORIGIN_DEGC) / SCALE_K)
-        expected, u2 = self.noise.expected(x)
-        s2 = pooled(*self.noise.rest(), (self.shape[0], 3)).ravel()
-        z = (np.nan_to_num(value) - expected) / np.sqrt(s2 * (1.0 + u2))
-        known = there & (self.noise.days - TERMS >= FEWEST_LEFT)
-        self.noise_scatter.update(z.reshape(-1, 3), known.reshape(-1, 3))
-        weight = there * np.where(known, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)), 1.0)
-        self.noise.update(day.number, x, np.nan_to_num(value), weight)
-        self.noise_scatter.remember(self.noise.begins)
+        expected, u2 = steps.expected(x)
+        s2 = pooled(*steps.rest(), (self.shape[0], 3)).ravel()
+        z = (np.nan_to_num(value) - expected) / np.sqrt(np.maximum(s2, 1e-12) * (u * u + u2))
+        known = there & (steps.days - TERMS >= FEWEST_LEFT)
+        scatter.update(z.reshape(-1, 3), known.reshape(-1, 3))
+        weight = there / (u * u) * np.where(known, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)), 1.0)
+        steps.update(day.number, x, np.nan_to_num(value), weight)
+        scatter.remember(steps.begins)
 
     def _seen(self, told: NDArray[np.bool_]) -> None:
         if np.isfinite(self.degc):
@@ -156,8 +176,8 @@ class SiteWatch:
             self.seen_degc[told, 1] = np.maximum(self.seen_degc[told, 1], self.degc)
 
 
-_OWN = ("origin", "seen_degc", "degc", "G")
-_PARTS = ("steps", "noise", "days_scatter", "band_scatter", "noise_scatter")
+_OWN = ("origin", "seen_degc", "degc", "G", "visits")
+_PARTS = ("steps", "noise", "means", "days_scatter", "band_scatter", "noise_scatter", "mean_scatter")
 
 
 def pooled(left: Array, freedom: Array, shape: tuple[int, ...]) -> Array:

@@ -55,6 +55,10 @@ SAID = [
     ("not heard", "Values until the last window that fitted .+ may be used: .+Of later values nobody knows",
      r"Not heard since .+, 35 d ago\. Its results came late: the newest one is of {50}, 45 d ago\."),
     ("retired", "Values until the last window that fitted .+ may be used", r"Not heard since .+, 45 d ago\.$"),
+    ("suspected", r"Values of today may be used with a larger U: ± 2.3 %, which holds the suspected change\. S and Q "
+     r"in force stay as they are\. Values before 2026-05-01 may be used with U as it was\.",
+     r"Suspected: Sensitivity of x fell by 1.10 % \(± 0.30 %\) since 2026-05-03 \(between 2026-05-01 and "
+     r"2026-05-05\)\."),
     ("not calibrated", "Values may not be used yet: no calibration is in force", "Windows are being collected"),
 ]  # fmt: skip
 HERE, KEYED = "on gateway bridge/span-2:", "on a machine with your key (KEY: its file; ENDPOINT: the router):"
@@ -67,7 +71,8 @@ RUN = [
     (HERE, f"{VISIT} deck-07"), (HERE, f"{VISIT} deck-08"), (HERE, f"{VISIT} deck-04"),
     *[(KEYED, f"fieldcal command accept --sequence 12 {ORDER}")] * 2,
     (KEYED, f"fieldcal command hold --release {ORDER}"), ("on the copy alone:", "sudo systemctl stop fieldcal"),
-    (HERE, DOCTOR), (HERE, DOCTOR), None, (HERE, "journalctl -fu fieldcal -o cat"),
+    (HERE, DOCTOR), (HERE, DOCTOR), None, (HERE, f"{VISIT} pier-2"),
+    (HERE, "journalctl -fu fieldcal -o cat"),
 ]  # fmt: skip
 RUN_OF = """all => all.map((c) => [...c.querySelectorAll('.command')].map((one) =>
     [one.previousElementSibling.textContent, one.querySelector('code').textContent]))"""

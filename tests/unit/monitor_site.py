@@ -28,6 +28,7 @@ from agent.monitor.plan import Plans
 from agent.monitor.running import Web, web_server
 from agent.monitor.server import application
 from agent.monitor.settings import FloorPlan
+from agent.monitor.site_watching import SiteWatching
 from tests.unit.zenoh_site import Site, wait_for
 
 STARTS_S = 30.0
@@ -69,9 +70,11 @@ class Served(AbstractContextManager["Served"]):
         stopping = threading.Event()
         self.live = Live([site.endpoint], None, stopping)
         plans = Plans(engine, access, plan)
+        self.watching = SiteWatching(self.database, self.fleet)
         app = application(
-            self.database, self.fleet, self.following, access, forwarding, self.live, stopping, plans, **more
-        )
+            self.database, self.fleet, self.following, access, forwarding, self.live, stopping, plans, self.watching,
+            **more,
+        )  # fmt: skip
         listening = self._open.enter_context(closing(socket.create_server(("127.0.0.1", 0))))
         self.address = f"127.0.0.1:{listening.getsockname()[1]}"
         web = Web(names=(), users=users, certificate=None, key=None, behind_proxy=behind_proxy)

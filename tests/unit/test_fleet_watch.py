@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from agent.cli.fleet import fleet
+from agent.core.events import RunStart, Tick, WatchReport
+from agent.recording.writer import Recorder
+from tests.unit.mounted_site import site_config
 
 HOUR_NS = 3_600_000_000_000
 FIRST_H = 24 * 20_000
@@ -35,7 +39,7 @@ def lines() -> list[dict[str, Any]]:
                 "gateway": gateway, "sensor": sensor, "hour_utc_ns": (FIRST_H + hour) * HOUR_NS, "duration_s": 3600.0,
                 "samples": 360_000, "sequence": hour, "noise_psd": [1e-6] * 3, "band_hz": BANDS_HZ,
                 "band_power": (np.exp(2.0 * a) + 1e-6).ravel().tolist(), "cross_power": cross.ravel().tolist(),
-                "temperature_degc": degc, "calibration_run_id": "run", "calibration_sequence": 3,
+                "temperature_degc": float(degc), "calibration_run_id": "run", "calibration_sequence": 3,
                 "u_main_pct": [0.2] * 3,
             })  # fmt: skip
     return made
@@ -123,6 +127,119 @@ def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[di
     told = run(tmp_path, rows)
     assert told.return_value == 0, told.output
     assert "learning" in next(line for line in told.output.splitlines() if line.startswith("middle/c"))
+
+
+@pytest.mark.slow
+def test_what_users_meet(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    """From some day on at one sensor: x and y exchanged, twice the sensitivity, dead outputs; wrong units at a gateway;
+    lines of another site among the others."""
+
+    def told(change: Callable[[dict[str, Any]], object], late: bool = True) -> dict[str, Any]:
+        rows = [dict(row) for row in clean]
+        for row in rows:
+            if row["sensor"] == "c" and row["sequence"] >= 24 * CHANGED:  # as if it had not changed
+                row["band_power"] = [*row["band_power"][:8], *(value / 0.97**2 for value in row["band_power"][8:])]
+            if not late or row["sequence"] >= 24 * CHANGED:
+                change(row)
+        found: dict[str, Any] = json.loads(run(tmp_path, rows, "--json", "-").stdout)
+        return found
+
+    def scaled(row: dict[str, Any], factor: float) -> None:
+        for name in ("band_power", "cross_power", "noise_psd"):
+            row[name] = [factor**2 * value for value in row[name]]
+
+    def exchanged(row: dict[str, Any]) -> None:
+        p, c = row["band_power"], row["cross_power"]
+        if row["sensor"] == "c":
+            row["band_power"], row["cross_power"] = [*p[4:8], *p[:4], *p[8:]], [*c[:4], *c[8:], *c[4:8]]
+
+    def one(found: dict[str, Any], sensor: str = "c") -> dict[str, Any]:
+        return next(each for each in found["sensors"] if each["sensor"] == sensor)
+
+    assert one(told(exchanged))["verdict"] == "sensor or structure"
+    doubled = one(told(lambda row: scaled(row, 2.0) if row["sensor"] == "c" else None))
+    assert (doubled["verdict"], doubled["what"]) == ("sensitivity", "sensitivity of x, y and z")
+    assert doubled["size"] == pytest.approx(100.0, abs=1.0), "in %, not its logarithm"
+    assert one(told(lambda _: None))["verdict"] == "none"
+    dead = told(lambda row: scaled(row, 0.0) if row["sensor"] == "c" else None)
+    assert one(dead)["last_day"] == "2024-10-31"
+    assert any("for 3 days or more by middle/c: silent, dead" in line for line in dead["not_seen"])
+    units = told(lambda row: scaled(row, 9.80665) if row["gateway"] == "north" else None)
+    north = units["gateways"]["north"]
+    assert north["size"] == pytest.approx(880.7, abs=north["expanded_uncertainty"])
+    mixed = told(lambda row: row.update(site="castle" if row["sensor"] == "f" else "bridge"), late=False)
+    assert list(mixed["left_out"]) == ["of another site than the first line that names one; give the files of one site"]
+    assert [each["sensor"] for each in mixed["sensors"]] == list("abcde")
+
+
+@pytest.mark.slow
+def test_a_visit_says_what_it_found_where_the_calibrations_are_told(
+    tmp_path: Path, clean: list[dict[str, Any]]
+) -> None:
+    """The visit finds what was suspected: z is 3 % less. The corrected values are then as before."""
+    visited, rows = 24 * (CHANGED + 8), [dict(row) for row in clean]
+    for row in rows:
+        if row["sensor"] == "c" and row["sequence"] >= visited:
+            row["calibration_sequence"] = 4
+            row["band_power"] = [*row["band_power"][:8], *(value / 0.97**2 for value in row["band_power"][8:])]
+    made = [{"key": f"fieldcal/v1/bridge/middle/c/{what}", "sensor": "c", "run_id": "run", "sequence": sequence,
+             "sensitivity": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, zz]]}
+            for what, sequence, zz in (("calibration", 3, 2.0), ("calibration", 4, 1.94))]  # fmt: skip
+    told = json.loads(run(tmp_path, [*made, *rows], "--json", "-").stdout)
+    assert told["lines"] == len(rows)
+    [visit] = told["visits"]
+    assert (visit["sensor"], visit["date"], visit["suspicion"]) == ("middle/c", "2024-11-09", "confirmed")
+    assert visit["found_pct"] == pytest.approx(-3.0, abs=1e-4)
+    assert visit["suspected_pct"] == pytest.approx(-3.0, abs=1.0)
+    assert told["common"]["size"] == pytest.approx(0.0, abs=told["common"]["expanded_uncertainty"])
+    [c] = [one for one in told["sensors"] if one["sensor"] == "c"]
+    assert (c["verdict"], c["suspected"]) == ("learning", None)
+    made[1]["sensitivity"][2] = [0.0, 0.0, 2.0]
+    refuted = json.loads(run(tmp_path, [*made, *rows], "--json", "-").stdout)
+    assert [one["suspicion"] for one in refuted["visits"]] == ["refuted"]
+    assert refuted["sensors"][5]["least_detectable_pct"][0] > 1.2 * told["sensors"][5]["least_detectable_pct"][0]
+
+
+def test_recordings_say_the_same_as_lines(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    few = [row for row in clean if row["sequence"] < 24 * 3]
+    lines_said = json.loads(run(tmp_path, few, "--json", "-").stdout)
+    paths = []
+    for gateway in ("north", "middle", "south"):
+        recorder = Recorder(tmp_path / gateway, [], [])
+        (tmp_path / gateway).mkdir()
+        start = RunStart(
+            run_id="run", site="bridge", gateway=gateway, boot_id="boot", t_monotonic_ns=0, t_utc_ns=FIRST_H * HOUR_NS,
+            config_json=site_config().model_dump_json(), versions={}, fingerprint={}, snapshot=b"", file_sequence=1,
+            event_sequence=0,
+        )  # fmt: skip
+        recorder.record(0, start, [])
+        for number, row in enumerate((row for row in few if row["gateway"] == gateway), start=1):
+            t_utc_ns = row["hour_utc_ns"] + HOUR_NS
+            assert recorder.record(number, Tick(t_monotonic_ns=number, t_utc_ns=t_utc_ns), [report(row, number)])
+        assert recorder.path is not None
+        path = recorder.path
+        recorder.close()
+        paths.append(str(path).removesuffix(".active"))
+    told = CliRunner().invoke(fleet, ["watch", *paths, "--json", "-"], standalone_mode=False)
+    assert told.exception is None, told.output
+    found = json.loads(told.stdout)
+    assert found == lines_said | {"sensors": found["sensors"]}
+    assert {one["sensor"] for one in found["sensors"]} == set("abcdef")
+    assert [one["days"] for one in found["sensors"]] == [3] * 6
+    torn = Path(paths[0]).read_bytes()
+    Path(paths[0]).write_bytes(torn[: len(torn) // 2])
+    again = CliRunner().invoke(fleet, ["watch", *paths], standalone_mode=False)
+    assert "the recording ends early" in again.stderr
+
+
+def report(row: dict[str, Any], sequence: int) -> WatchReport:
+    """The result of a row."""
+    own = {name: row[name] for name in WatchReport.__struct_fields__ if name in row}
+    return WatchReport(
+        **own | {"sequence": sequence}, run_id="run",
+        t_utc_ns=row["hour_utc_ns"] + HOUR_NS, stuck=0, clipped=0, missing=0, segments=60, mean_mps2=[float("nan")] * 3,
+        mean_scatter_mps2=[float("nan")] * 3, temperature_scatter_degc=0.1,
+    )  # fmt: skip
 
 
 def test_bad_files_and_options(tmp_path: Path, clean: list[dict[str, Any]]) -> None:

@@ -5,22 +5,27 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import msgspec
 import pytest
+from click.testing import CliRunner
 
+from agent.cli.fleet import fleet as fleet_command
 from agent.core.events import DriftReport
 from agent.delivery.keys import Address
 from agent.delivery.publication import Publisher
 from agent.delivery.received import Received
+from agent.delivery.record import StoredResult
 from agent.delivery.store import Store
 from agent.keys.certificates import issue, make_authority
 from agent.keys.files import write_new
+from tests.unit.test_fleet_watch import lines, report
 from tests.unit.zenoh_site import Site, record, wait_for
 
 pytest.importorskip("starlette", reason="the extra monitor is not installed")
@@ -63,6 +68,41 @@ def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway:
         assert "count" in monitor.get(f"sensor.csv?{asked}calibration")
     finally:
         monitor.stop(signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_hours_of_the_bus_are_kept_and_read_while_the_monitor_runs(site: Site, tmp_path: Path) -> None:
+    """From a gateway's store over the bus into the database; `fieldcal fleet watch` reads it meanwhile."""
+    rows = [row for row in lines()[: 6 * 24] if row["sensor"] == "c"]
+    with ExitStack() as opened:
+        store = opened.enter_context(closing(Store(tmp_path / "gateway")))
+        first = store.last_sequence() + 1
+        publisher = Publisher("site", "gw", [site.endpoint], store)
+        monitor = Monitor(site.endpoint, tmp_path / "monitor")
+        opened.callback(monitor.stop)
+        publisher.start()
+        opened.callback(publisher.close)
+
+        def send(result: StoredResult) -> None:
+            store.commit([result])
+            publisher.publish(result)
+
+        send(record(first, "status", sensor="c", status="HELD", reason="none"))
+        wait_for(lambda: bool(monitor.sensors()))  # of a gateway that it meets, it has no older results
+        for k, row in enumerate(rows, start=1):
+            send(StoredResult.of(report(row, first + k), recorded=True, recording="", epoch=store.epoch))
+        file = tmp_path / "monitor" / "monitor.sqlite"
+
+        def read() -> dict[str, Any]:
+            told = CliRunner().invoke(fleet_command, ["watch", str(file), "--json", "-"], standalone_mode=False)
+            found: dict[str, Any] = json.loads(told.stdout) if told.stdout else {}
+            return found
+
+        wait_for(lambda: read().get("lines") == 24)
+        assert [(one["gateway"], one["sensor"], one["verdict"]) for one in read()["sensors"]] == [
+            ("gw", "c", "learning")
+        ]
+        assert monitor.get("api/watch?site=site") is None, "no day has closed"
 
 
 def test_a_drift_stays_one_over_a_restart(site: Site, tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_a_run_loads_neither_virtual_worlds_nor_what_is_done_at_a_desk() -> None
     assert "agent.core.pipeline" in loaded
     desk = re.compile(
         r"hw\.(virtual|conformance)\b"
-        r"|agent\.(bench|calibrate|certificate|export|fleet|monitor|reading|report)\b"
+        r"|agent\.(bench|calibrate|certificate|export|fleet|monitor|reading|report|site_watch)\b"
         r"|calib\.(adjustment|paper|recorded|site_adjustment|site_watch|visit)\b"
     )
     assert desk.match("hw.virtual.bench")

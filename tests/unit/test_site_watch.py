@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from calib.model import Array
-from calib.site_watch.day import Day, Hours, day_of
+from calib.site_watch.day import Day, Hours, Visits, day_of
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR, TERMS, Steps, inverted
 from calib.site_watch.together import ALL, DIRECTIONS, design, jointly
 from calib.site_watch.verdicts import SiteVerdicts, examined, limit_of, result
-from calib.site_watch.watch import SiteWatch
+from calib.site_watch.visits import teach
+from calib.site_watch.watch import PRIOR_VISITS, VISIT, SiteWatch
 
 BANDS_HZ = 10.0 ** (np.arange(0, 6) / 10.0)
 GATEWAY = np.array([0, 0, 0, 1, 1, 1, 2, 2, 2])
@@ -223,7 +224,7 @@ def test_what_all_share_is_seen_by_a_sensor_beside_a_reference_alone(learned: tu
 def test_a_visit_begins_the_norm_anew(learned: tuple[Site, SiteWatch]) -> None:
     site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
     change[4, :3] = 0.05
-    watch.update(site.day(change), np.arange(9) == 4)
+    watch.update(site.day(change), Visits.unknown(np.arange(9) == 4))
     found = result(watched(site, 12, watch, change))
     assert kinds(found) == {4: "learning"}
     assert kinds(result(watched(site, 20, watch, change))) == {}
@@ -317,3 +318,98 @@ def test_hours_are_merged_without_their_levels_and_without_noise() -> None:
 
 def test_directions_name_all_parts_once() -> None:
     assert np.array_equal(np.delete(DIRECTIONS, ALL, axis=0), np.eye(6))
+
+
+def found_at(sensors: list[int], found: float, u: float = 0.002) -> Visits:
+    """Visits at these sensors that find this change of all three sensitivities."""
+    told = Visits(np.isin(np.arange(9), sensors), np.full((9, 3), np.nan), np.full(9, np.inf))
+    told.found[sensors], told.u[sensors] = found, u
+    return told
+
+
+def test_a_visit_that_confirms_changes_nothing_and_one_that_refutes_loosens_all_tests(
+    learned: tuple[Site, SiteWatch],
+) -> None:
+    site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
+    change[4, :3] = -0.03
+    watched(site, 12, watch, change)
+    before = examined(watch)
+    assert before is not None
+    confirmed, refuted = (SiteWatch.loaded(watch.snapshot()) for _ in range(2))
+    teach(confirmed, found_at([4], -0.03))
+    teach(refuted, found_at([4], 0.0))
+    row = dict(zip(VISIT, confirmed.visits[0].tolist(), strict=True))
+    assert (row["sensor"], row["suspected"], row["found"], row["day"]) == (
+        4,
+        1,
+        pytest.approx(np.log(0.97)),
+        watch.day + 1,
+    )
+    assert abs(row["size"] + 0.03) < 3.0 * row["u"]
+    assert confirmed.taught() == 1.0
+    z2 = row["size"] ** 2 / (row["u"] ** 2 + 0.002**2)
+    assert z2 > 40.0
+    assert refuted.taught() == pytest.approx((PRIOR_VISITS + z2) / (PRIOR_VISITS + 1))
+    after = examined(refuted)
+    assert after is not None
+    walk = before.joint.u[0, 0, ALL]
+    assert after.joint.u[0, 0, ALL] == pytest.approx(walk * np.sqrt(refuted.taught()), rel=0.05)
+    teach(refuted, Visits.unknown(np.arange(9) == 2))
+    assert len(refuted.visits) == 1, "what nobody knows teaches nothing"
+    again = SiteWatch.loaded(refuted.snapshot())
+    assert np.array_equal(again.visits, refuted.visits)
+
+
+def test_visits_tell_what_all_sensors_share(learned: tuple[Site, SiteWatch]) -> None:
+    """All sensors lose 2 %, sensor 4 another 3 %: two visits find it, whichever of the sensors they are at."""
+    site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
+    change[4, :3] = -0.03
+    watched(site, 12, watch, change - np.repeat([0.02, 0.0], 3))
+    assert kinds(result(watch)) == {4: "sensitivity"}
+    visits = found_at([4], -0.05)
+    visits.there[1], visits.found[1], visits.u[1] = True, -0.02, 0.002
+    teach(watch, visits)
+    watch.update(site.day(change - np.repeat([0.02, 0.0], 3)), visits)
+    found = result(watch)
+    assert found.common is not None
+    assert found.common.what == "all sensors, by 2 visits in 400 days"
+    assert abs(found.common.size + 0.02) < found.common.U < 0.006
+    assert found.common.U >= 2.0 * 0.002, "both rest on one reference"
+    assert found.hidden == found.common.U
+    assert found.sensors[4].kind == "learning"
+
+
+def test_a_visit_of_a_gateway_that_was_told_finds_its_change_not_a_common_one(
+    learned: tuple[Site, SiteWatch],
+) -> None:
+    site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
+    change[3:6, :3] = -0.02
+    watched(site, 12, watch, change)
+    assert list(result(watch).gateways) == [1]
+    teach(watch, found_at([3, 4, 5], -0.02))
+    found = result(watch)
+    assert found.common is not None
+    assert abs(found.common.size) < found.common.U
+    assert watch.visits[:, VISIT.index("suspected")].tolist() == [1, 1, 1]
+
+
+def test_gravity_is_asked_at_the_date_of_the_change(learned: tuple[Site, SiteWatch]) -> None:
+    """z of sensor 4 loses 3 %, gravity with it; of sensor 6 it loses 3 % too, which gravity does not share."""
+    site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
+    random, gravity = np.random.default_rng(4), np.tile([0.3, -0.2, 9.8], (9, 1))
+    change[[4, 6], 2] = -0.03
+    for k in range(40):
+        mean = gravity.copy()
+        mean[4, 2] *= 0.97 if k >= 28 else 1.0
+        day = site.day(change if k >= 28 else None)
+        mean += 0.002 * (day.temperature_degc - 10.0) + random.normal(0.0, 0.005, (9, 3))
+        watch.update(replace(day, mean_mps2=mean))
+    told = result(watch).sensors
+    assert [(i, one.what) for i, one in enumerate(told) if one.kind != "none"] == [
+        (4, "sensitivity of z"), (6, "sensitivity of z")]  # fmt: skip
+    says = [{one.name: one for one in told[i].witnesses} for i in (4, 6)]
+    assert [list(one) for one in says] == [["structure", "gravity", "noise"]] * 2
+    assert (says[0]["gravity"].says, says[1]["gravity"].says) == ("agrees", "contradicts")
+    assert abs(says[0]["gravity"].size + 0.03) < 3.0 * says[0]["gravity"].u < 0.01
+    assert abs(says[1]["gravity"].size) < 3.0 * says[1]["gravity"].u
+    assert says[0]["noise"].says == "silent"

@@ -3,9 +3,10 @@ import { $, clean, full, get, make, placeOf, table, text, view } from "./common.
 import { ago, AXES, band, day, DAY_NS, finite, moment, now, signed, two } from "./format.js";
 import { card, chip, KINDS, spark, tile } from "./parts.js";
 import { saveTable } from "./picture.js";
+import { structureCard } from "./site-watch.js";
 import { cardPlot, certificate, covered, largest, ofDoubled, shortName, stateOf, steps, timeOf, told as toldOf, unjudged } from "./words.js";
 
-const WORST = ["drifting", "held", "doubled", "changed", "no data", "silent", "uncalibrated", "gateway"]; // the worst first
+const WORST = ["drifting", "held", "doubled", "changed", "no data", "structure", "suspected", "silent", "uncalibrated", "gateway"]; // the worst first
 const LET_GO_MS = 600000; // after which nobody is taken to look at a page that was not touched, as on a wall
 const CARDS = 5; // that are shown at once; more by a button
 const SCALE_PCT = 1; // of the small plots of the table, all alike
@@ -30,7 +31,7 @@ function wanted(row, filter) {
 
 function showCounts(sensors, kind, go) {
   const count = (one) => sensors.filter((row) => row.kind === one).length;
-  const kinds = ["sound", "drifting", "held", "silent", ...["changed", "doubled", "no data", "uncalibrated", "retired"].filter(count)];
+  const kinds = ["sound", "drifting", "held", "silent", ...["changed", "suspected", "doubled", "no data", "uncalibrated", "retired"].filter(count)];
   const key = JSON.stringify([kinds.map(count), sensors.length, kind]);
   if ($("counts").dataset.key === key) return;
   const focused = [...$("counts").children].indexOf(document.activeElement);
@@ -46,9 +47,10 @@ function showCounts(sensors, kind, go) {
 function needs(sensors, gateways) {
   const rank = (row) => WORST.indexOf(row.kind), byGateway = (row) => row.kind === "doubled" || (row.kind === "silent" && row.gateway_state === "silent"), found = [], kindOf = (gateway) => (gateway.mixed_utc_ns ? "doubled" : "gateway");
   const silent = Map.groupBy(sensors.filter((row) => row.kind === "silent" && byGateway(row)), gatewayOf);
-  for (const row of sensors.filter((one) => rank(one) >= 0 && !byGateway(one))) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? 0 });
+  for (const row of sensors.filter((one) => rank(one) >= 0 && !byGateway(one))) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? row.suspected?.visit_information_nat ?? 0 });
   for (const [name, rows] of silent) found.push({ key: `gateway ${name}`, row: rows.reduce((a, b) => ((b.last_good_utc_ns ?? 0) < (a.last_good_utc_ns ?? 0) ? b : a)), rows, rank: WORST.indexOf("silent"), size: rows.length });
   for (const gateway of gateways.filter((g) => g.why && g.alive)) found.push({ key: `state ${gatewayOf(gateway)}`, gateway, kind: kindOf(gateway), rank: WORST.indexOf(kindOf(gateway)), size: 0 });
+  for (const site of gateways.length ? latest?.sites ?? [] : []) found.push({ key: `site ${site.site}`, site, rank: WORST.indexOf("structure"), size: 0 });
   return found.sort((a, b) => a.rank - b.rank || b.size - a.size || (a.key < b.key ? -1 : 1));
 }
 
@@ -57,7 +59,8 @@ const ofGateway = (kind) => (kind !== "doubled" ? { steps: [make("p", "The state
   usable: ["bad", [make("b", "Values of its sensors may not be used"), ": nobody knows whose calibration is shown."]], steps: ofDoubled(),
 });
 
-function drawn({ row, rows, gateway, kind }) {
+function drawn({ row, rows, gateway, kind, site }) {
+  if (site) return structureCard(site);
   if (gateway) return card({ kind, name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`, say: [`${gateway.why}.`, ...(gateway.mixed_utc_ns ? [" Noticed ", moment(gateway.mixed_utc_ns), "."] : [])], more: [], plot: null, ...ofGateway(kind) });
   const found = trends.get(full(row))?.told, { say, more } = toldOf(row, found), usable = covered(row, found);
   if (rows) {
@@ -84,7 +87,7 @@ function showCards(sensors, gateways, filter) {
   put($("new-cards"), differs ? `${differs}: show` : "Another is the worst: sort");
   for (const key of keys) {
     const need = known.get(key), before = cards.get(key);
-    const from = need && JSON.stringify([need.row?.changed, need.rows?.map((row) => row.changed), need.gateway, trends.get(need.row && full(need.row))?.at]);
+    const from = need && JSON.stringify([need.row?.changed, need.rows?.map((row) => row.changed), need.gateway, need.site, trends.get(need.row && full(need.row))?.at]);
     if (before?.from === from || (before && inHand(before.element))) continue; // it is drawn anew when the person has let go of it
     if (!need) { before?.element.querySelector(".chip").replaceWith(chip("over")); if (before) before.from = from; continue; }
     const element = drawn(need);

@@ -28,6 +28,7 @@ const INVENTED = [
   [row("deck-05", { kind: "no data", status: "INVALID", status_utc_ns: t[50], reason: "deck-05 is lost: [Errno 121] Remote I/O error", last_good_utc_ns: t[47] }), history([calm, calm, calm].map((v) => v.slice(0, 48)), { t_utc_ns: long, held_utc_ns: t[50] })],
   [row("tower-4", { kind: "silent", gateway_state: "silent", last_good_utc_ns: t[50], result_utc_ns: t[50], heard_utc_ns: t[52] }), {}],
   [row("tower-2", { kind: "retired", gateway_state: "silent", last_good_utc_ns: t[50], result_utc_ns: t[50], heard_utc_ns: t[50] }), {}],
+  [row("pier-2", { kind: "suspected", reference: "", verdicts: [], suspected: { axes: "x", turn: false, size: -0.011, expanded_uncertainty: 0.003, since: "2026-05-03", earliest: "2026-05-01", latest: "2026-05-05", u_pct: 2.3, witnesses: [{ name: "structure", says: "agrees", size: -0.011, expanded_uncertainty: 0.003 }, { name: "gravity", says: "silent", size: null, expanded_uncertainty: null }, { name: "noise", says: "silent", size: null, expanded_uncertainty: null }] } }), {}],
   [row("deck-09", { kind: "uncalibrated", status: "COLLECTING", reason: "Sxz, Syz are not determined", calibration_utc_ns: null, last_good_utc_ns: null }), {}],
 ];
 const sound = [row("deck-01", {}), history([calm, calm, drift], {})];

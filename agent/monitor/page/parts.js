@@ -2,18 +2,20 @@
 import { make, text } from "./common.js";
 import { finite } from "./format.js";
 
-// What a sensor counts as (agent.monitor.fleet): its words, its colour, and what they mean. The last two are of cards.
+// What a sensor counts as (agent.monitor.fleet): its words, its colour, and what they mean. The last three are of cards.
 export const KINDS = {
   sound: ["in order", "ok", "Windows fit S and Q in force, and no drift and no step is found."],
   drifting: ["drifting", "bad", "The agent's test has found a slow change of S or Q. Whether S and Q in force follow it stands beside “values”."],
   changed: ["changed", "bad", "S or Q has changed at once, and S and Q in force follow: the change was adopted."],
   held: ["held", "warn", "New windows contradict S and Q in force, which stay: a person must look. Or an operator put it on hold."],
+  suspected: ["suspected", "warn", "Of a sensor without a reference: the other sensors of its site say that its sensitivity or direction has changed. S and Q in force stay; U is enlarged until a visit."],
   silent: ["not heard", "off", "The gateway has left the bus, or three intervals passed without a result. What was taken down can be named in the configuration of the monitor."],
   retired: ["retired", "off", "It was taken down, says the configuration of the monitor. When it is heard again it is as any other."],
   "no data": ["no data", "bad", "The gateway gets no samples of the sensor."],
   uncalibrated: ["not calibrated", "off", "No calibration is in force yet."],
   doubled: ["two of one name", "bad", "Two gateways, as of a copied memory card, give results under one name, so nobody knows whose they are. A run is a gateway from its start to its end."],
   gateway: ["gateway", "warn", "The gateway itself needs a person."],
+  structure: ["structure", "warn", "The sensors of a site say together that the structure has changed."],
   over: ["over", "off", "This no longer needs a person."],
 };
 export const chip = (kind) => make("span", KINDS[kind][0], { class: `chip ${KINDS[kind][1]}`, title: KINDS[kind][2] });

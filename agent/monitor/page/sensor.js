@@ -6,6 +6,7 @@ import { ago, AXES, band, day, finite, MAIN, moment, NAMES, plusMinus, rounded, 
 import { bars, chip, may } from "./parts.js";
 import { savePlots } from "./picture.js";
 import { boxOf, curves, TimePlots } from "./plots.js";
+import { showSiteWatch } from "./site-watch.js";
 import { cause, certificate, covered, explanation, shortName, steps, timeOf, told as toldOf, unjudged } from "./words.js";
 
 const NEWEST = 100; // results of each kind that are asked for, beside the calibrations of the whole history
@@ -222,6 +223,7 @@ function sections(place, found, whole, hours, later) {
 // --- the view
 
 function begin(place) {
+  $("site-watch-card").hidden = true;
   const gateway = `${place.get("site")}/${place.get("gateway")}`, sensor = place.get("sensor");
   const hold = (given) => ({ gateway, sensor, verb: "hold", arguments: given });
   $("crumbs").replaceChildren(make("a", "Fleet", { href: "#" }), text(` / ${place.get("site")} / ${place.get("gateway")}`));
@@ -270,6 +272,7 @@ export async function show(told, go) {
     showBudget(newest, row, trends);
     showDevice(row, newest, found.clock, trends);
     showHypotheses(row, found.status);
+    showSiteWatch(place, () => current === mine).catch(() => undefined); // the next change asks again
     showEvents(found.status, found.drift, found.estimate);
     refold(sections(place, found, whole, hours, later));
     for (const draw of later) draw();

@@ -3,6 +3,7 @@ import { commandLine } from "./commands.js";
 import { clean, isUnheard, make } from "./common.js";
 import { ago, AXES, band, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
 import { copier, spark } from "./parts.js";
+import { suspectedSteps, suspectedUsable, suspectedWords } from "./site-watch.js";
 
 const LEAST_PCT = 0.2; // half the range of a small plot at least, so that noise is not made large
 const MONTH_DAYS = 30.44, YEAR_DAYS = 365.25;
@@ -77,6 +78,7 @@ export function covered(row, trends) {
   }
   const changes = row.verdicts.map((v) => [beganOf(v, trends?.found?.[v.parameter])[0], v.first_utc_ns]), from = Math.min(...changes.map(([begun]) => begun)), told = Math.max(...changes.map(([, at]) => at)), followed = Math.max(told, trends?.adopted_utc_ns ?? 0);
   if (changes.length && row.calibration_utc_ns < told) return ["bad", [make("b", ["Values since ", day(from), " may not be used"]), ": S and Q in force are of ", day(row.calibration_utc_ns), " and do not follow the change. Earlier ones may: ", ...U, "."]];
+  if (row.kind === "suspected") return suspectedUsable(row);
   const old = timeOf(row) - row.calibration_utc_ns > DAY_NS ? [" (of ", day(row.calibration_utc_ns), ")"] : [];
   const late = changes.length ? ["; S and Q follow the change. Values of ", day(from), " to ", day(followed), ", before they did, may be wrong by it"] : [];
   return ["ok", [make("b", "Values of today may be used"), ": ", ...U, ...old, ...late, "."]];
@@ -188,6 +190,7 @@ export function told(row, trends) {
   if (isUnheard(row)) return { say: silence(row), more: inTurn(verdicts.map((v) => ["Before: ", ...v])) };
   if (row.kind === "doubled") return { say: ["Two gateways have this name, and their results are mixed."], more: inTurn(verdicts.map((v) => ["One of them: ", ...v])) };
   if (row.kind === "held") return heldWords(row, verdicts, trends);
+  if (row.kind === "suspected") return suspectedWords(row);
   if (verdicts.length) return { say: inTurn(verdicts), more: [often(row, trends), ...steady(row), witnessed(trends?.beside), ...(row.status === "HELD" ? [" Held: ", ...reason] : [])] };
   if (row.kind === "no data") return { say: ["No data since ", make("b", moment(since)), ": ", ...reason], more: [] };
   if (row.kind === "uncalibrated") return { say: [row.status === "COLLECTING" ? "Windows are being collected: " : "No calibration is in force: ", ...reason], more: [] };
@@ -218,6 +221,7 @@ export function steps(row, trends) {
   const told = row.kind === "held" ? advice(row.reason, waits, trends) : "", asked = told.includes(BELOW) ? `Run it ${KEYED}` : `If the sensor has really changed, accept estimate ${row.estimate}, ${KEYED}`;
   const accept = waits ? [make("p", asked), copier(order("accept", { sequence: row.estimate }))] : [];
   if (row.kind === "silent") return [make("p", `Look at power and network, then ${here}`), copier(`fieldcal doctor ${GATEWAY}`)];
+  if (row.kind === "suspected") return suspectedSteps(row);
   if (row.kind === "changed") return [make("p", "Find out what happened to it: mount, cable, temperature, reference."), ...visit()];
   if (row.kind === "drifting") return [...visit(), ...(accept.length ? accept : [make("p", "If that agrees, accept what it shows.")])];
   if (row.kind === "held" && ON_HOLD.test(row.reason)) return [make("p", `An operator put it on hold. To use windows again, ${KEYED}`), copier(order("hold", { release: true }))];

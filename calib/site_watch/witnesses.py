@@ -1,0 +1,78 @@
+"""What else than the structure says of a change: gravity (the mean of each output) and the noise floor.
+
+Both are asked at the date that the structure has told, so no date is sought. A change of the sensitivity of an axis
+by s changes its mean by s times the mean, since gravity is always there; a turn changes the means as it changes any
+acceleration. A witness that could not see a change of this size is silent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.model import Array
+from calib.site_watch.together import DIRECTIONS
+
+AGREES = 2.0  # standard uncertainties within which two sizes agree, and below which a size cannot be seen
+LEAST_NOISE = 3.0  # standard uncertainties from which the noise floor has changed, at a date that others tell
+LEAST_U_MPS2 = 1e-5  # of a change of the mean, however steady it is: no output is read that exactly
+TURNS = 3  # index in theta of the first turn
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Witness:
+    """What one witness says of a change: `says` is agrees, contradicts or silent.
+
+    `size`, `u`: the relative change (or angle in rad) that it tells by itself, of the noise that of its amplitude;
+    NaN and inf where it tells none.
+    """
+
+    name: str
+    says: str
+    size: float = float("nan")
+    u: float = float("inf")
+
+
+def gravity(direction: int, size: float, u: float, mean: Array, step: Array, u_step: Array) -> Witness:
+    """Gravity on a change of `size` ± `u` in DIRECTIONS[direction].
+
+    `mean`, `step`, `u_step` (3,): the mean acceleration, how it changed at the date, and the standard uncertainty of
+    this, in m/s².
+    """
+    theta = DIRECTIONS[direction]
+    moved = theta[:TURNS] * mean + _turned(theta[TURNS:], mean)  # for a change of one unit
+    weight = np.where(np.isfinite(u_step) & np.isfinite(moved), 1.0 / np.square(np.maximum(u_step, LEAST_U_MPS2)), 0.0)
+    moved = np.where(weight > 0.0, moved, 0.0)
+    information = float(np.sum(weight * moved**2))
+    if information * size**2 < AGREES**2:
+        return Witness("gravity", "silent")
+    told = float(np.sum(weight * moved * np.where(weight > 0.0, step, 0.0))) / information
+    u_told = information**-0.5
+    alike = abs(told - size) <= AGREES * float(np.hypot(u_told, u))
+    return Witness("gravity", "agrees" if alike else "contradicts", told, u_told)
+
+
+def noise(direction: int, step: Array, u_step: Array) -> Witness:
+    """The noise floor on a change in DIRECTIONS[direction]; `step`, `u_step` (3,): of the log amplitude at the date.
+
+    Noise that changes with the sensitivity says that the sensor has changed, not the structure at it.
+    """
+    axes = np.flatnonzero(DIRECTIONS[direction][:TURNS])
+    if not len(axes):
+        return Witness("noise", "silent")
+    z = np.abs(step[axes]) / u_step[axes]
+    best = axes[int(np.argmax(z))]
+    if not z.max() > LEAST_NOISE:
+        return Witness("noise", "silent")
+    factor = float(np.exp(step[best]))
+    return Witness("noise", "agrees", factor - 1.0, factor * float(u_step[best]))
+
+
+def _turned(turn: Array, mean: Array) -> Array:
+    """W a, with W as in calib.site_watch.together: a turn about x adds a_z to y and takes a_y from z."""
+    changed = np.zeros(3)
+    for w in range(3):
+        changed[(w + 1) % 3] += turn[w] * mean[(w + 2) % 3]
+        changed[(w + 2) % 3] -= turn[w] * mean[(w + 1) % 3]
+    return changed
