@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import threading
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -59,7 +58,7 @@ class Service:
         self._data_dir = data_dir
         self._watch = watch
         self._weighing = Weighing(config)
-        self._stop_request = threading.Event()
+        self._stopping = False
         self._sequence = 0
         self._run_id = uuid.uuid4().hex
         self.refused: list[str] = []  # why the run ended by itself: transfers that the adapters of all channels refuse
@@ -67,7 +66,7 @@ class Service:
 
     def stop(self) -> None:
         """End the run that has begun; `run` returns within two seconds."""
-        self._stop_request.set()
+        self._stopping = True  # no event: a handler of signals does this, and another signal may interrupt it
 
     def run(self, duration_s: float | None) -> None:
         """Read, calibrate, record and publish until `stop` is called or `duration_s` seconds have passed.
@@ -231,7 +230,7 @@ class Service:
         by_device, refused = {reader.device: reader for reader in readers}, dict[str, str]()
         next_tick = time.monotonic() + TICK_S
         end = float("inf") if duration_s is None else time.monotonic() + duration_s
-        while not (self._stop_request.is_set() or self.refused) and time.monotonic() < end:
+        while not (self._stopping or self.refused) and time.monotonic() < end:
             for gap in events.take_gaps():
                 self._step(gap, writer)
             event = events.get(min(POLL_S, next_tick - time.monotonic(), end - time.monotonic()))

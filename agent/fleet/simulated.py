@@ -29,7 +29,7 @@ from agent.delivery.history import FILE_NAME, StoredResult, connect_read_only
 from agent.delivery.keys import PREFIX, result_key
 from agent.delivery.publication import Publisher
 from agent.delivery.received import LARGEST_RESULT
-from agent.delivery.session import session_config
+from agent.delivery.session import closed_in_time, session_config
 from agent.delivery.store import Store
 from agent.fleet.simulated_sensor import BEGINS, RUN_ID, VARIANTS, Behaviour, SimulatedSensor, Story
 from agent.recording.result_signing import ResultSigner
@@ -250,7 +250,7 @@ class SimulatedGateway:
             session = zenoh.open(session_config("client", connect=self._connect))
         except zenoh.ZError:
             return
-        with session:
+        with closed_in_time(session):
             for key, payload, attachment in self._hostile(records):
                 session.put(key, payload, attachment=attachment)
 
