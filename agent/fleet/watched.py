@@ -153,9 +153,7 @@ def _taken(
     reason = _wrong(line)
     if reason:
         return reason
-    parts = line.key.split("/")
-    named = parts[3] if len(parts) == 6 and parts[:2] == ["fieldcal", "v1"] else ""
-    who = line.gateway or named or stem, line.sensor
+    who = line.gateway or _named(line.key) or stem, line.sensor
     if who not in numbers and len(numbers) >= MOST_SENSORS:
         return f"more than {MOST_SENSORS} sensors"
     i = numbers.setdefault(who, len(numbers))
@@ -167,10 +165,20 @@ def _taken(
     if before is None or before[0] <= line.sequence:
         day[i, hour] = line.sequence, *at
         bands.update(_grid(line.band_hz))
-        known = [u for u in line.u_main_pct if u is not None and u > 0.0]
-        if known:
-            found.u_main[i] = max(known) / 100.0
+        if (u := _largest_u(line)) is not None:
+            found.u_main[i] = u
     return "" if before is None else "an hour of a sensor twice; the one with the higher sequence is used"
+
+
+def _largest_u(line: WatchLine) -> float | None:
+    """The largest relative U of the main sensitivities; None where none is told."""
+    return max((u / 100.0 for u in line.u_main_pct if u is not None and u > 0.0), default=None)
+
+
+def _named(key: str) -> str:
+    """The gateway that a key of Zenoh names; "" where it is no key of a result."""
+    parts = key.split("/")
+    return parts[3] if len(parts) == 6 and parts[:2] == ["fieldcal", "v1"] else ""
 
 
 def _wrong(line: WatchLine) -> str:
