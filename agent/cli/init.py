@@ -235,7 +235,7 @@ def _devices(asking: Interview, given: dict[str, Any]) -> list[ChosenDevice]:
     return chosen
 
 
-def _of_probe(role: Role, device: ProbedDevice, options: dict[str, SourcedValue]) -> ChosenDevice:
+def _of_probe(role: Role, device: ProbedDevice, options: dict[str, SourcedValue[Any]]) -> ChosenDevice:
     """A device that the probe found, with its options as far as others are not stated."""
     source = f"probe: {device.label}"
     of_probe = {name: SourcedValue(value, source) for name, value in device.options.items()}
