@@ -23,6 +23,7 @@ import copy
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from typing import TypeVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from calib.site_watch.day import Hours, day_of
 from calib.site_watch.verdicts import SiteVerdicts, result
 from calib.site_watch.watch import SiteWatch
 
+T = TypeVar("T")
 GATEWAYS = {8: 3, 30: 5, 200: 10}
 LEARNED_DAYS = 240
 CASES_OF_A_SITE = {8: 8, 30: 20, 200: 40}
@@ -52,7 +54,7 @@ def learned(seed: int, sensors: int, world: World) -> tuple[Bridge, SiteWatch]:
     """A site that has learned."""
     bridge = Bridge(seed, sensors, GATEWAYS[sensors], world)
     bridge.hour = 24 * (61 * seed % 365)
-    watch = SiteWatch(bridge.gateway, BANDS_HZ)
+    watch = SiteWatch(bridge.gateway, BANDS_HZ)  # type: ignore[arg-type] # whole numbers
     for hours in bridge.days(LEARNED_DAYS):
         watch.update(day_of(hours, BANDS_HZ))
     return bridge, watch
@@ -110,7 +112,8 @@ def others(bridge: Bridge, watch: SiteWatch, cases: int, count: Counter[str]) ->
             int(random.integers(3)),
         )
         own = np.flatnonzero(bridge.gateway == g)
-        (found,) = told_after(watch, (changed(hours, own, 0.99) for hours in future), (14,))
+        later = (changed(hours, own, 0.99) for hours in future)  # type: ignore[arg-type] # whole numbers
+        (found,) = told_after(watch, later, (14,))
         count["gateway cases"] += 1
         count["gateway told"] += list(found.gateways) == [g]
         count["gateway others"] += any(x >= 0 and bridge.gateway[x] != g for x in named(found))
@@ -164,7 +167,8 @@ def sound(seed: int, sensors: int, count: Counter[str]) -> None:
     """A sound site for two years: alarms by kind."""
     bridge = Bridge(seed, sensors, GATEWAYS[sensors])
     bridge.hour = 24 * (61 * seed % 365)
-    watch, last = SiteWatch(bridge.gateway, BANDS_HZ), {}
+    watch = SiteWatch(bridge.gateway, BANDS_HZ)  # type: ignore[arg-type] # whole numbers
+    last = dict[tuple[tuple[str, int], str], int]()
     for number, hours in enumerate(bridge.days(SITE_DAYS)):
         watch.update(day_of(hours, BANDS_HZ))
         if number < FIRST_LOOK or number % 7:
@@ -285,16 +289,25 @@ def cost() -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     for sensors in GATEWAYS:
-        bridge = Bridge(1, sensors, GATEWAYS[sensors])
-        hours = list(bridge.days(10))
-        merge, few = used(lambda hours=hours: [day_of(one, BANDS_HZ) for one in hours])
-        watch = SiteWatch(bridge.gateway, BANDS_HZ)
-        whole, _ = used(lambda few=few, watch=watch: [watch.update(_later(few[k % 10], k)) for k in range(365)])
-        read, _ = used(lambda watch=watch: result(watch))
-        size = sum(part.nbytes for part in arrays(watch.snapshot())) / 1e3 / sensors
-        lines.append(f"| {sensors} | {whole:.2f} | {read:.2f} | {size:.0f} | {100.0 * merge:.1f} |")
+        lines.append(_cost_row(sensors))
         print(lines[-1], flush=True)
     return "\n".join(lines)
+
+
+def _cost_row(sensors: int) -> str:
+    bridge = Bridge(1, sensors, GATEWAYS[sensors])
+    hours = list(bridge.days(10))
+    merge, few = used(lambda: [day_of(one, BANDS_HZ) for one in hours])
+    watch = SiteWatch(bridge.gateway, BANDS_HZ)  # type: ignore[arg-type] # whole numbers
+
+    def year() -> None:
+        for k in range(365):
+            watch.update(_later(few[k % 10], k))
+
+    whole, _ = used(year)
+    read, _ = used(lambda: result(watch))
+    size = sum(part.nbytes for part in arrays(watch.snapshot())) / 1e3 / sensors
+    return f"| {sensors} | {whole:.2f} | {read:.2f} | {size:.0f} | {100.0 * merge:.1f} |"
 
 
 def _later(day, number: int):  # type: ignore[no-untyped-def]
@@ -303,7 +316,7 @@ def _later(day, number: int):  # type: ignore[no-untyped-def]
     return day
 
 
-def used(what: Callable[[], object]) -> tuple[float, object]:
+def used(what: Callable[[], T]) -> tuple[float, T]:
     """Processor time of a call, in s, and what it gives."""
     begin = time.process_time()
     given = what()
