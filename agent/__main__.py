@@ -8,6 +8,8 @@ import sys
 from agent.cli.stopping import end_at_once_by_signals
 from agent.delivery.ending import ProcessEnd
 
+EXIT_S = 10.0  # s for what a command leaves behind: exit handlers, and threads that wait for Zenoh or a device
+
 
 def main() -> None:
     """Run the command line; see `fieldcal --help`."""
@@ -29,6 +31,7 @@ def main() -> None:
         from agent.cli.main import run_cli
 
         ending.status = run_cli()
+        ending.within(EXIT_S)
     except KeyboardInterrupt:  # while modules load
         ending.status = 130
     sys.exit(ending.status)

@@ -184,7 +184,7 @@ class Bridge:
         hours = self.hour + np.arange(PER_DAY)
         self.hour += PER_DAY
         inside = degc[:PER_DAY, None] + 0.3 * random.standard_normal((PER_DAY, n))
-        return Hours(hours, power, cross, told, inside)
+        return Hours(hours, power, cross, told, inside)  # type: ignore[arg-type] # whole numbers, and half the memory
 
     def _realised(self, b: int, modes: Array) -> Array:
         """(24, modes, modes): the estimate of an identity from an hour; real part of a complex Wishart matrix."""

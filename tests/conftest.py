@@ -28,7 +28,10 @@ if TYPE_CHECKING:
     from tests.unit.zenoh_site import Site
 
 SCENARIOS = "tests/scenarios/"
-NICE = 5  # of processes that take other tests
+COMPUTED = "tests/scenarios/test_online_"  # worlds of days and years, which wait for nothing
+NICE = (
+    15  # of processes that take other tests: a program that keeps pace with the clock gets the processor when it asks
+)
 
 # A shell starts a command in the background with SIGINT ignored, and nohup with SIGHUP: every child of the tests would
 # ignore Ctrl-C and the end of its terminal too.
@@ -42,14 +45,14 @@ settings.load_profile("fieldcal")
 
 
 class ScenariosBesideTheRest(LoadScopeScheduling):
-    """Gives the scenarios to every second process, and the other tests to the others, until one kind has run out.
+    """Gives the scenarios to every second process, and what computes to the others, until one kind has run out.
 
     A scenario waits most of its time for a program that runs against the clock; meanwhile the other tests compute.
     """
 
     def _assign_work_unit(self, node: WorkerController) -> None:
         for_scenarios = takes_scenarios(node)
-        wanted = next((scope for scope in self.workqueue if scope.startswith(SCENARIOS) == for_scenarios), None)
+        wanted = next((scope for scope in self.workqueue if keeps_pace(scope) == for_scenarios), None)
         if wanted is not None:
             self.workqueue.move_to_end(wanted, last=False)
         super()._assign_work_unit(node)
@@ -71,6 +74,11 @@ def write_engine_id() -> None:
     written = path.with_suffix(f".{os.getpid()}")
     written.write_text(json.dumps(identity.computed()))
     written.replace(path)
+
+
+def keeps_pace(scope: str) -> bool:
+    """Whether the tests of a file start programs that keep pace with the clock."""
+    return scope.startswith(SCENARIOS) and not scope.startswith(COMPUTED)
 
 
 def takes_scenarios(node: WorkerController) -> bool:

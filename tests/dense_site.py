@@ -151,7 +151,7 @@ class Dense:
 
 def dense(site: SimulatedSite) -> Dense:
     """Least squares of all samples of a site and of all that is stated, by Gauss-Newton."""
-    stated, start, u = site.stated, [], []
+    stated, start, u = site.stated, list[float](), list[float]()
     where: dict[tuple[str, ...], slice] = {}
 
     def unknown(name: tuple[str, ...], values: Array, uncertainty: Array | float) -> None:

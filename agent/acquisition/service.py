@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import threading
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -59,7 +58,7 @@ class Service:
         self._data_dir = data_dir
         self._watch = watch
         self._weighing = Weighing(config)
-        self._stop_request = threading.Event()
+        self._stopping = False
         self._sequence = 0
         self._run_id = uuid.uuid4().hex
         self.refused: list[str] = []  # why the run ended by itself: transfers that the adapters of all channels refuse
@@ -67,7 +66,7 @@ class Service:
 
     def stop(self) -> None:
         """End the run that has begun; `run` returns within two seconds."""
-        self._stop_request.set()
+        self._stopping = True  # no event: a handler of signals does this, and another signal may interrupt it
 
     def run(self, duration_s: float | None) -> None:
         """Read, calibrate, record and publish until `stop` is called or `duration_s` seconds have passed.
@@ -84,29 +83,8 @@ class Service:
         check_owner(self._data_dir, name)
         recording = config.recording
         signer = Signer.load(recording.signing_key, recording.earlier_keys) if recording.signing_key else None
-        recall = partial(memories_of, restore=Pipeline.restore)
-        key = GatewayKey(name, signer) if signer is not None else None
-        self._store = Store(self._data_dir, keep=keep_results(config.results), recall=recall, key=key)
-        if self._store.set_aside:
-            _log.warning(
-                "the state file was corrupt and is kept as %s; a new one is made from the recordings",
-                self._store.set_aside,
-            )
-        if (found := self._store.recovered).results or found.memories:
-            lacked = "%d results and the states of %d devices that the state file lacked were found in the recordings"
-            _log.warning(lacked, found.results, found.memories)
-        self._recorder = Recorder(
-            self._data_dir,
-            [device.name for device in config.devices],
-            [channel.sensor for channel in config.channels],
-            max_bytes=int(config.recording.rotate_bytes),
-            max_age_s=config.recording.rotate_s,
-            keep=keep_files(config.recording),
-            ledger=self._store,
-            signer=signer,
-            tell_head=self._tell_head,
-            epoch=self._store.epoch,
-        )
+        self._store = self._opened_store(GatewayKey(name, signer) if signer is not None else None)
+        self._recorder = self._new_recorder(signer)
         self._recorder.close_torn()
         events = EventQueue(len(config.devices))
         readers = [reader_of(device, events) for device in config.devices]
@@ -127,22 +105,52 @@ class Service:
                     reader.start()
                 self._loop(events, writer, readers, duration_s)
         finally:
-            self._supervisor.closing()
-            if self._reception is not None:
-                self._reception.close()
-            for reader in readers:
-                reader.stop()
-            deadline = time.monotonic() + READER_STOP_S
-            for reader in readers:
-                if reader.ident is not None:
-                    reader.join(max(0.0, deadline - time.monotonic()))
-            recorded = writer.close()
-            if self._publisher is not None:
-                self._publisher.close()
-            if self._mqtt is not None:
-                self._mqtt.close()
-            if recorded:
-                self._end_store(writer.whole)
+            self._end(readers, writer)
+
+    def _opened_store(self, key: GatewayKey | None) -> Store:
+        """The store, made anew from the recordings as far as it is damaged."""
+        recall = partial(memories_of, restore=Pipeline.restore)
+        store = Store(self._data_dir, keep=keep_results(self._config.results), recall=recall, key=key)
+        if store.set_aside:
+            kept = "the state file was corrupt and is kept as %s; a new one is made from the recordings"
+            _log.warning(kept, store.set_aside)
+        if (found := store.recovered).results or found.memories:
+            lacked = "%d results and the states of %d devices that the state file lacked were found in the recordings"
+            _log.warning(lacked, found.results, found.memories)
+        return store
+
+    def _new_recorder(self, signer: Signer | None) -> Recorder:
+        config = self._config
+        return Recorder(
+            self._data_dir,
+            [device.name for device in config.devices],
+            [channel.sensor for channel in config.channels],
+            max_bytes=int(config.recording.rotate_bytes),
+            max_age_s=config.recording.rotate_s,
+            keep=keep_files(config.recording),
+            ledger=self._store,
+            signer=signer,
+            tell_head=self._tell_head,
+            epoch=self._store.epoch,
+        )
+
+    def _end(self, readers: Sequence[Reader], writer: RecordingThread) -> None:
+        """End what `run` has begun: first what brings events, last the store."""
+        self._supervisor.closing()
+        if self._reception is not None:
+            self._reception.close()
+        for reader in readers:
+            reader.stop()
+        deadline = time.monotonic() + READER_STOP_S
+        for reader in readers:
+            if reader.ident is not None:
+                reader.join(max(0.0, deadline - time.monotonic()))
+        recorded = writer.close()
+        for sink in (self._publisher, self._mqtt):
+            if sink is not None:
+                sink.close()
+        if recorded:
+            self._end_store(writer.whole)
 
     def _end_store(self, whole: bool) -> None:
         """Close the store; with the states after the last event, if the recordings hold all events (`whole`)."""
@@ -231,7 +239,7 @@ class Service:
         by_device, refused = {reader.device: reader for reader in readers}, dict[str, str]()
         next_tick = time.monotonic() + TICK_S
         end = float("inf") if duration_s is None else time.monotonic() + duration_s
-        while not (self._stop_request.is_set() or self.refused) and time.monotonic() < end:
+        while not (self._stopping or self.refused) and time.monotonic() < end:
             for gap in events.take_gaps():
                 self._step(gap, writer)
             event = events.get(min(POLL_S, next_tick - time.monotonic(), end - time.monotonic()))

@@ -231,10 +231,15 @@ def _devices(asking: Interview, given: dict[str, Any]) -> list[ChosenDevice]:
         device = _pick(asking, role, candidates)
         if device is not None:
             found.remove(device)
-            source = f"probe: {device.label}"
-            of_probe = {name: SourcedValue(value, source) for name, value in device.options.items()}
-            chosen.append(ChosenDevice(role, SourcedValue(device.driver, source), of_probe | options))
+            chosen.append(_of_probe(role, device, options))
     return chosen
+
+
+def _of_probe(role: Role, device: ProbedDevice, options: dict[str, SourcedValue[Any]]) -> ChosenDevice:
+    """A device that the probe found, with its options as far as others are not stated."""
+    source = f"probe: {device.label}"
+    of_probe = {name: SourcedValue(value, source) for name, value in device.options.items()}
+    return ChosenDevice(role, SourcedValue(device.driver, source), of_probe | options)
 
 
 def _found() -> list[ProbedDevice]:

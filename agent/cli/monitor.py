@@ -19,7 +19,7 @@ from agent.config.key_file import KeyFileError, read_private_key
 from agent.config.known_keys import read_known_keys
 from agent.config.reading import ConfigError
 from agent.delivery.router import DEFAULT_ENDPOINT, open_router, router_running
-from agent.delivery.session import EndpointError
+from agent.delivery.session import EndpointError, closed_in_time
 from agent.monitor.rights import RIGHTS
 from agent.terminal.text import say
 
@@ -116,7 +116,7 @@ def monitor(
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             listening = stack.enter_context(socket.create_server((host, port), family=family))
             if with_router and not router_running(DEFAULT_ENDPOINT):
-                stack.enter_context(open_router(None)[0])
+                stack.enter_context(closed_in_time(open_router(None)[0]))
             data_dir.mkdir(parents=True, exist_ok=True)
             _say_address(
                 listen, https=https_certificate is not None, open_to_all=users is None and not _is_loopback(host)

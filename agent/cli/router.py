@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import resource
-import signal
-import threading
 from pathlib import Path
 
 import click
 import zenoh
 
+from agent.delivery.ending import StopRequest
 from agent.delivery.router import DEFAULT_ENDPOINT, open_router
-from agent.delivery.session import EndpointError, EndpointRefused
+from agent.delivery.session import EndpointError, EndpointRefused, closed_in_time
 from agent.terminal.text import say
 
 
@@ -30,9 +29,7 @@ def router(listen: str | None, config_file: Path | None) -> int:
     """Serve until SIGINT or SIGTERM. Exit status: 2 invalid endpoint or configuration, 1 the port is in use."""
     _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, files))  # two for each client
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = StopRequest.by_signals()
     try:
         session, endpoints = open_router(listen, config_file)
     except EndpointError as error:
@@ -40,7 +37,7 @@ def router(listen: str | None, config_file: Path | None) -> int:
         return 1 if isinstance(error, EndpointRefused) else 2
     # From now on Zenoh prints which clients it refuses, and why; RUST_LOG sets other levels (docs/security.md).
     zenoh.init_log_from_env_or("warn")
-    say(f"router at {', '.join(endpoints)}")
-    stop.wait()
-    session.close()
+    with closed_in_time(session):
+        say(f"router at {', '.join(endpoints)}")
+        stop.wait()
     return 0

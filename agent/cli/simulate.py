@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
-import threading
 import time
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 
 from agent.cli.rules import check_rules
 from agent.cli.simulate_fleet import fleet_options, serve_fleet
+from agent.delivery.ending import StopRequest
 from agent.terminal.text import say
 from hw.virtual.bench import Bench, Truth
 from hw.virtual.playback import PlaybackError, Player, read_track
@@ -195,32 +194,30 @@ class _Serving:
     """Serves ports until it is told to stop. SIGINT and SIGTERM end it in order, so that no links are left."""
 
     def __init__(self) -> None:
-        self._stopped = threading.Event()
-        self._undo = ExitStack()
+        self._stop = StopRequest.by_signals()
+        self._open = ExitStack()
 
     def __enter__(self) -> _Serving:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._undo.callback(signal.signal, number, signal.signal(number, lambda *_: self._stopped.set()))
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._undo.close()
+        self._open.close()
 
     def start(self, device: PtyDevice) -> PtyDevice:
         """Serve this port until `_Serving` ends."""
-        self._undo.callback(device.stop)
+        self._open.callback(device.stop)
         device.start()
         return device
 
     def goes_on(self) -> bool:
         """Wait a moment; False after a request to stop."""
-        return not self._stopped.wait(POLL_S)
+        return not self._stop.wait(POLL_S)
 
     def wait_for_reader(self, device: PtyDevice) -> bool:
         """Wait until a reader has opened and set up the port; False after a request to stop."""
         while self.goes_on():
             if device.has_reader():
-                return not self._stopped.wait(SETTLE_S)
+                return not self._stop.wait(SETTLE_S)
         return False
 
     def linger(self, device: PtyDevice) -> None:

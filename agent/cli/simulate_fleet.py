@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import resource
-import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from agent.delivery.ending import StopRequest
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -62,11 +62,9 @@ def serve_fleet(
     from agent.config.known_keys import add_key
     from agent.delivery.router import DEFAULT_ENDPOINT
     from agent.delivery.session import EndpointError
-    from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses, Stopping
+    from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses
 
-    endpoint, stop = connect or DEFAULT_ENDPOINT, Stopping()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    endpoint, stop = connect or DEFAULT_ENDPOINT, StopRequest.by_signals()
     try:
         if fault := _files_fault(min(fleet, GATEWAYS_EACH)) or _router_fault(endpoint, stop):
             say(f"fieldcal simulate: {fault}", err=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import math
-import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -21,9 +20,10 @@ from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare
 from agent.cli.tls_options import tls_files, tls_options
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import KnownKeys, WatchedKeys
+from agent.delivery.ending import StopRequest
 from agent.delivery.hearing import Hearing
 from agent.delivery.keys import PREFIX, parse_key
-from agent.delivery.session import EndpointError, session_config
+from agent.delivery.session import EndpointError, close_in_time, closed_in_time, session_config
 from agent.keys.files import write_new
 from agent.recording.signing import Signer, load_public_key
 from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
@@ -69,9 +69,7 @@ def witness(
 
     Exit status: 1 no router or a fault of the disk, 2 bad input.
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = StopRequest.by_signals()
     tls = tls_files(endpoints, ca, certificate, certificate_key)
     try:
         kept = Witness(directory, _signer(directory), _keys(public_keys, known_keys), time.time_ns)
@@ -85,7 +83,7 @@ def witness(
     except zenoh.ZError:
         say(f"fieldcal witness: no Zenoh router answers at {', '.join(endpoints)}", err=True)
         return 1
-    with session:
+    with closed_in_time(session):
         return _follow(session, key, kept, stop)
 
 
@@ -101,7 +99,7 @@ def _keys(public_keys: Sequence[Path], known_keys: Path | None) -> Callable[[], 
     return lambda: replace(watched.now(), anywhere=anywhere)
 
 
-def _follow(session: zenoh.Session, key: str, kept: Witness, stop: threading.Event) -> int:
+def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) -> int:
     subscriber = declare_advanced_subscriber(
         session,
         key,
@@ -147,7 +145,7 @@ def _take_all(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
 
 def _until_lost(
     session: zenoh.Session, key: str, take_all: Callable[[], None], subscriber: AdvancedSubscriber[Any],
-    stop: threading.Event,
+    stop: StopRequest,
 ) -> bool:  # fmt: skip
     """Take heads in a thread until `stop` is set, or the router does not answer any more; returns whether it does."""
     thread = threading.Thread(target=take_all, name="witness", daemon=True)
@@ -158,7 +156,7 @@ def _until_lost(
     heard = True
     while heard and not stop.wait(LOOK_S):
         heard = not hearing.lost()
-    subscriber.undeclare()
+    close_in_time(subscriber.undeclare)
     thread.join(CLOSE_S)
     return heard
 

@@ -9,7 +9,7 @@ import zenoh
 
 from agent.commanding.envelope import LARGEST
 from agent.config.tls import TlsFiles
-from agent.delivery.session import session_config
+from agent.delivery.session import closed_in_time, session_config
 
 CONNECT_S = 5.0
 ANSWER_S = 5.0  # s; the agent answers after one fsync
@@ -27,7 +27,7 @@ def send(endpoints: Sequence[str], tls: TlsFiles | None, key: str, data: bytes) 
     except zenoh.ZError:
         hint = "; a router also gives no answer where it does not trust the certificate" if tls else ""
         raise ConnectionError(f"no Zenoh router answers at {', '.join(endpoints)}{hint}") from None
-    with session:
+    with closed_in_time(session):
         # Target ALL, since the gateway's history answers on the same keys too. Consolidation would delay the answer.
         replies = session.get(
             key,

@@ -28,7 +28,7 @@ from agent.delivery.presence import Presence
 from agent.delivery.progress import Progress
 from agent.delivery.questions import Dialogue, GatewayAnswer, Questions, Replies, answer_of, steps
 from agent.delivery.received import Received, number_of, receive
-from agent.delivery.session import session_config
+from agent.delivery.session import close_in_time, session_config
 from agent.delivery.turns import Turns
 from agent.delivery.verifying import Refusals, UnverifiedError, Verifier
 
@@ -36,7 +36,7 @@ INBOX = 1000  # samples that may wait; further ones are dropped and later fetche
 CONNECT_S = 10.0
 RECONNECT_S = 2.0  # s between two attempts to reach a router again with another session
 LOOK_S = 1.0  # s between two looks whether the router still hears
-CLOSE_S = 2.0  # that closing waits for the thread that takes samples; it ends at once unless the inbox is full
+CLOSE_S = 1.0  # s that closing waits for the thread that takes samples; it ends at once unless the inbox is full
 
 
 __all__ = ["Consumer", "Received"]
@@ -136,7 +136,7 @@ class Consumer:
             self._taking.start()
             self._hearing.begin(session)
             if self._closed.is_set():
-                self._questions.close(opened.close)
+                self._close_session()
 
     def _is_lost(self) -> bool:
         with self._changing:
@@ -144,7 +144,7 @@ class Consumer:
 
     def _reconnect(self) -> None:
         """Open another session in place of this one, as soon as a router answers."""
-        self._questions.close(self._open.close)
+        self._close_session()
         while not self._closed.is_set():
             try:
                 self._connect()
@@ -214,10 +214,13 @@ class Consumer:
         """End the iteration and the session. May be called twice, from any thread."""
         self._closed.set()
         with self._changing:
-            self._questions.close(self._open.close)
+            self._close_session()
         self._inbox.put(_Wake.CLOSED)
         self._taking.join(CLOSE_S)
         atexit.unregister(self.close)
+
+    def _close_session(self) -> None:
+        self._questions.close(lambda: close_in_time(self._open.close))
 
     def __enter__(self) -> Self:
         return self

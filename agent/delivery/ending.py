@@ -1,4 +1,4 @@
-"""Ends the process after its exit handlers, and before Python finalises the interpreter.
+"""How a program is told to stop, and how it ends: after its exit handlers, before Python finalises the interpreter.
 
 While the interpreter is finalised, Python up to 3.13 ends each other thread that comes back into it by `pthread_exit`
 (CPython issue 87135). Where such a thread comes from Zenoh, functions in Rust are on its stack. These let no unwinding
@@ -11,7 +11,12 @@ from __future__ import annotations
 
 import atexit
 import os
+import select
+import signal
 import sys
+import threading
+from collections.abc import Callable
+from typing import Any
 
 
 class ProcessEnd:
@@ -24,6 +29,12 @@ class ProcessEnd:
         self.status = 1
         atexit.register(self._leave)
 
+    def within(self, limit_s: float) -> None:
+        """The process ends after `limit_s` at the latest, also where a thread or an exit handler waits for ever."""
+        end = threading.Timer(limit_s, self._leave)
+        end.daemon = True
+        end.start()
+
     def _leave(self) -> None:
         for stream in (sys.stdout, sys.stderr):
             try:
@@ -31,3 +42,53 @@ class ProcessEnd:
             except (OSError, ValueError):  # nobody reads it, the disk is full, or it is closed
                 self.status = self.status or 1
         os._exit(self.status)
+
+
+class StopRequest:
+    """Whether this program is to stop, here and in processes to which this object is given: a pipe that is never read.
+
+    A handler of signals may call `set` at any moment; an event of threads or processes has a lock, which the code that
+    the signal interrupts may hold. It is also set where the process that made it has ended.
+    """
+
+    def __init__(self) -> None:
+        self._ends: tuple[int, ...] = os.pipe()  # to read; to write, only with its maker
+
+    @classmethod
+    def by_signals(cls) -> StopRequest:
+        """One that SIGINT and SIGTERM set from now on."""
+        stop = cls()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        return stop
+
+    def set(self) -> None:
+        """Stop."""
+        if not self.is_set():
+            os.write(self._ends[1], b"x")
+
+    def is_set(self) -> bool:
+        """Whether to stop."""
+        return self.wait(0.0)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait for it, for so many s at most; returns whether to stop."""
+        waiting = select.poll()
+        waiting.register(self._ends[0], select.POLLIN)
+        return bool(waiting.poll(None if timeout is None else 1000.0 * timeout))
+
+    def __reduce__(self) -> tuple[Callable[..., StopRequest], tuple[object]]:
+        from multiprocessing.reduction import DupFd  # only a program with several processes loads it
+
+        return _received, (DupFd(self._ends[0]),)
+
+    def __del__(self) -> None:
+        for end in self._ends:
+            os.close(end)
+
+
+def _received(reader: Any) -> StopRequest:
+    """A StopRequest in another process than that of its maker."""
+    stop = StopRequest.__new__(StopRequest)
+    stop._ends = (reader.detach(),)
+    return stop

@@ -14,7 +14,7 @@ import zenoh
 from agent.config.tls import TlsFiles
 from agent.delivery.guide import WHAT, Guide, signature_of
 from agent.delivery.keys import gateway_key, result_key
-from agent.delivery.session import session_config
+from agent.delivery.session import closed_in_time, session_config
 
 if TYPE_CHECKING:
     from agent.recording.signing import Signer
@@ -74,7 +74,7 @@ class GuidePublisher:
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
-                with zenoh.open(self._config) as session:
+                with closed_in_time(zenoh.open(self._config)) as session:
                     self._serve(session)
             except zenoh.ZError as error:
                 _log.warning("the page of the monitor does not show this bench: %s", error)

@@ -23,6 +23,7 @@ import zenoh
 
 from agent.delivery.keys import presence_key
 from agent.delivery.presence import GATEWAYS_MAX
+from agent.delivery.session import closed_in_time
 
 TOGETHER_S = 30.0  # s; three times what a router takes to give up a link
 INSTANCES_MAX = 8  # of one gateway that are looked at; a stranger may declare tokens for ever
@@ -92,7 +93,7 @@ def watch_own_name(config: zenoh.Config, key: str, stop: threading.Event, tell: 
     pause_s = random.uniform(0.0, SPREAD_S)
     while not stop.wait(pause_s):
         try:
-            with zenoh.open(config) as session:
+            with closed_in_time(zenoh.open(config)) as session:
                 watched = Instances(session, f"{key}/**")
                 end_s = time.monotonic() + TOGETHER_S + 2 * LOOK_S
                 while (watched.doubled or time.monotonic() < end_s) and not stop.wait(LOOK_S):

@@ -22,7 +22,7 @@ from agent.delivery.hearing import Hearing
 from agent.delivery.history import History, StoredResult, StoreError
 from agent.delivery.instances import watch_own_name
 from agent.delivery.keys import gateway_key, result_key
-from agent.delivery.session import session_config
+from agent.delivery.session import closed_in_time, session_config
 from agent.delivery.store import Store
 
 BATCH = 100  # results read from the store at a time
@@ -180,7 +180,7 @@ class Publisher:
         with ExitStack() as open_things:
             if self._tls and (warning := expiry_warning(self._tls, datetime.now(UTC))):
                 _log.warning("zenoh.tls.%s", warning)
-            session = open_things.enter_context(zenoh.open(self._config))
+            session = open_things.enter_context(closed_in_time(zenoh.open(self._config)))
             history = open_things.enter_context(self._store.history())
             queryable = session.declare_queryable(f"{self._key}/**", zenoh.handlers.FifoChannel(64), complete=True)
             answers = threading.Thread(

@@ -61,13 +61,8 @@ def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | N
     rows = connection.execute("SELECT sensor, what, count, up_to, crc FROM removed")
     removed = {(row[0], row[1]): row[3] for row in map(checked, rows)}
     for number, path in reversed(recordings(directory)):
-        try:
-            found = scan(path)
-        except OSError as error:
-            _log.warning("%s: cannot be read, its results are not restored to the store: %s", path, error.strerror)
+        if (found := _scanned(path)) is None:
             continue
-        for fault in found.faults:
-            _log.warning("%s: some results are not restored to the store: %s", path, fault)
         if not recovered.file_sequence and first_event(path) is not None:  # without it the number is used again
             recovered.file_sequence = number
             recovered.published = _published(found.metadata.get(FILE_METADATA, {}))
@@ -80,6 +75,18 @@ def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | N
         if found.results and not missing and not everything:
             break
     return recovered
+
+
+def _scanned(path: Path) -> ScannedFile | None:
+    """The file; None where it cannot be read. What of it cannot be used is in the log."""
+    try:
+        found = scan(path)
+    except OSError as error:
+        _log.warning("%s: cannot be read, its results are not restored to the store: %s", path, error.strerror)
+        return None
+    for fault in found.faults:
+        _log.warning("%s: some results are not restored to the store: %s", path, fault)
+    return found
 
 
 def records_of(path: Path, found: ScannedFile) -> list[StoredResult]:

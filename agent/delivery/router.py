@@ -9,7 +9,7 @@ from pathlib import Path
 import zenoh
 
 from agent.config.files import read_file
-from agent.delivery.session import EndpointError, EndpointRefused, check_private_key, session_config
+from agent.delivery.session import EndpointError, EndpointRefused, check_private_key, closed_in_time, session_config
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LARGEST_FILE = 1 << 20  # bytes; access rules for a thousand gateways take half of this
@@ -22,13 +22,10 @@ def router_running(endpoint: str) -> bool:
     config = session_config("client", connect=[endpoint])
     config.insert_json5("connect/timeout_ms", json.dumps(int(ANSWER_S * 1000)))
     try:
-        session = zenoh.open(config)
+        with closed_in_time(zenoh.open(config)) as session:
+            return bool(session.info.routers_zid())
     except zenoh.ZError:
         return False
-    try:
-        return bool(session.info.routers_zid())
-    finally:
-        session.close()
 
 
 def open_router(listen: str | None, config_file: Path | None = None) -> tuple[zenoh.Session, list[str]]:

@@ -73,16 +73,13 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[SiteDevice], list[Meeting]]
     together: dict[tuple[str, str], list[RecordedChannel]] = {}
     for one in found:
         together.setdefault((one.sensor, one.reference), []).append(one)
-    if len(gravities := {one.gravity_mps2 for one in found}) > 1:
-        raise TableError(
-            f"the recordings state different gravity ({', '.join(f'{g:g}' for g in sorted(gravities))} m/s2), so they "
-            "are not of one site; adjust them apart"
-        )
+    _check_gravity(found)
     meetings, devices = [], dict[str, SiteDevice]()
     sensors = {one.sensor for one in found if one.tables is not None}
     for (sensor, reference), own in together.items():
-        tables = [one.tables for one in own if one.tables is not None]
-        first = next((one for one in own if one.tables is not None), own[0])
+        usable = [one for one in own if one.tables is not None]
+        tables = [one.tables for one in usable if one.tables is not None]
+        first = next(iter(usable), own[0])
         reason = first.reason
         if reference in sensors:
             reason = f"{reference} is a sensor of another channel too; describe such a site in a TOML file"
@@ -96,6 +93,15 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[SiteDevice], list[Meeting]]
         devices.setdefault(sensor, SiteDevice.known(sensor, mean, covariance))
         devices.setdefault(reference, SiteDevice.reference(reference, first.priors.reference, first.channels))
     return list(devices.values()), meetings
+
+
+def _check_gravity(found: Sequence[RecordedChannel]) -> None:
+    """Raise TableError where the recordings state several values."""
+    if len(gravities := {one.gravity_mps2 for one in found}) > 1:
+        raise TableError(
+            f"the recordings state different gravity ({', '.join(f'{g:g}' for g in sorted(gravities))} m/s2), so they "
+            "are not of one site; adjust them apart"
+        )
 
 
 def _channels(path: Path, start: RunStart) -> Iterator[RecordedChannel]:

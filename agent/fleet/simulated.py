@@ -29,7 +29,7 @@ from agent.delivery.history import FILE_NAME, StoredResult, connect_read_only
 from agent.delivery.keys import PREFIX, result_key
 from agent.delivery.publication import Publisher
 from agent.delivery.received import LARGEST_RESULT
-from agent.delivery.session import session_config
+from agent.delivery.session import closed_in_time, session_config
 from agent.delivery.store import Store
 from agent.fleet.simulated_sensor import BEGINS, RUN_ID, VARIANTS, Behaviour, SimulatedSensor, Story
 from agent.recording.result_signing import ResultSigner
@@ -171,10 +171,7 @@ class SimulatedGateway:
             self._twin = self._cloned(stop)
         if self._twin is not None:
             self._twin.step(t_utc_ns, stop)
-        results: list[Result] = []
-        for sensor in self._sensors:
-            first = self._store.last_sequence() + 1 + len(results)
-            results += sensor.results(self._round, t_utc_ns, first)
+        results = self._results(t_utc_ns)
         self._round += 1
         records = [self._record(result) for result in results]
         self._store.commit(records)
@@ -184,6 +181,14 @@ class SimulatedGateway:
         if self.behaviour == "hostile":
             self._attack(records)
         return len(records)
+
+    def _results(self, t_utc_ns: int) -> list[Result]:
+        """The results of all sensors in this round."""
+        results: list[Result] = []
+        for sensor in self._sensors:
+            first = self._store.last_sequence() + 1 + len(results)
+            results += sensor.results(self._round, t_utc_ns, first)
+        return results
 
     def truth(self) -> dict[str, Any]:
         """What is true of the gateway and its sensors now, for comparison with what is said of them."""
@@ -250,7 +255,7 @@ class SimulatedGateway:
             session = zenoh.open(session_config("client", connect=self._connect))
         except zenoh.ZError:
             return
-        with session:
+        with closed_in_time(session):
             for key, payload, attachment in self._hostile(records):
                 session.put(key, payload, attachment=attachment)
 

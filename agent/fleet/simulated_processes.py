@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from agent.delivery.ending import ProcessEnd
+from agent.delivery.ending import ProcessEnd, StopRequest
 from agent.delivery.session import session_config
 from agent.fleet.simulated import SimulatedFleet
 from agent.fleet.simulated_sensor import Behaviour
@@ -27,35 +27,8 @@ NICE = 10  # gateways are other machines: simulated ones leave the processor to 
 SPAWN = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
 
 _part: SimulatedFleet  # in a process of the fleet: its gateways
-_stop: Stopping  # and whether they are to stop
+_stop: StopRequest  # and whether they are to stop
 Value = TypeVar("Value")
-
-
-class Stopping:
-    """Whether several processes are to stop: a pipe that is never read. It is also set where its maker has ended.
-
-    A handler of signals may call `set` at any moment; an event of threads or processes has a lock, which the code that
-    the signal interrupts may hold.
-    """
-
-    def __init__(self) -> None:
-        self._reader, self._writer = SPAWN.Pipe(duplex=False)
-
-    def set(self) -> None:
-        """Stop, here and in all processes that have got this object."""
-        if not self.is_set():
-            self._writer.send_bytes(b"stop")
-
-    def is_set(self) -> bool:
-        """Whether to stop."""
-        return self._reader.poll()
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait for it, for so many s at most; returns whether to stop."""
-        return self._reader.poll(timeout)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_reader": self._reader}  # only its maker has the end that keeps it open
 
 
 class NamedGateway(NamedTuple):
@@ -75,15 +48,16 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
     """
 
     def __init__(
-        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path, stop: Stopping | None = None
-    ) -> None:
+        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path,
+        stop: StopRequest | None = None,
+    ) -> None:  # fmt: skip
         """`stop`: once it is set, what is going on ends soon."""
         session_config("client", connect=connect)  # raises EndpointError here rather than in another process
         parts = -(-count // GATEWAYS_EACH)
         self.gateways: list[NamedGateway] = []
         self.unconnected = 0
         self._parts: list[ProcessPoolExecutor] = []
-        self._stop = stop or Stopping()
+        self._stop = stop or StopRequest()
         self._left = threading.Event()  # all processes have ended
         threading.Thread(target=self._end_in_time, name="end", daemon=True).start()
         with ExitStack() as opened:
@@ -153,7 +127,7 @@ def _without_interrupts() -> Iterator[None]:
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _begin(stop: Stopping) -> None:
+def _begin(stop: StopRequest) -> None:
     global _stop
     _stop = stop
     ProcessEnd().status = 0

@@ -24,7 +24,7 @@ from agent.delivery.hearing import Hearing
 from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.received import Received
 from agent.delivery.seldom import Seldom
-from agent.delivery.session import session_config
+from agent.delivery.session import closed_in_time, session_config
 from agent.delivery.verifying import Refusals, UnverifiedError
 from agent.monitor.benches import Benches
 from agent.monitor.database import Database
@@ -33,7 +33,7 @@ from agent.monitor.fleet import Fleet, Place
 
 RECONNECT_S = 2.0  # s between two attempts to reach a router
 AGAIN_S = 1.0  # s between two attempts to write to a database that cannot be written
-CLOSE_S = 2.0
+CLOSE_S = 1.0  # s to wait for a thread; what it has not kept by then is fetched again from the gateways
 LOOK_S = 1.0  # s between two looks whether the router still hears
 LOG_S = 60.0  # s between two lines of the log about the same thing
 # Results in one transaction at most: what PostgreSQL takes for one is shared, and SQLite delays no question for long.
@@ -161,7 +161,7 @@ class Following:
     def _follow(self) -> None:
         last = self._database.last_sequence()
         consumer = self._consumer = Consumer(self._endpoints, last_sequence=last, tls=self._tls, keys=self.keys)
-        with consumer, zenoh.open(self._config) as session:
+        with consumer, closed_in_time(zenoh.open(self._config)) as session:
             self._open.callback(consumer.close)
             if self._stop.is_set():  # `close` may have been before the callback
                 return

@@ -18,7 +18,7 @@ from starlette.responses import Response, StreamingResponse
 from agent.config.tls import TlsFiles
 from agent.core.events import Acceleration
 from agent.delivery.keys import CHUNK, gateway_key
-from agent.delivery.session import session_config
+from agent.delivery.session import closed_in_time, session_config
 from agent.monitor.spectrum import LastMinute, usable
 from agent.recording.acceleration import decode_acceleration
 
@@ -63,7 +63,8 @@ class Live:
             return  # many came at the same moment; a page asks again
         self.streams += 1
         try:
-            with await anyio.to_thread.run_sync(zenoh.open, self._config) as session:
+            session = await anyio.to_thread.run_sync(zenoh.open, self._config)
+            with closed_in_time(session, within_s=0.0):  # all other pages would wait for it
                 subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(2))
                 begun_s = heard_s = told_s = time.monotonic()
                 minute, fresh = LastMinute(), False

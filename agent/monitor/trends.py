@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -63,32 +63,27 @@ class Trends:
         if not history:
             return {}
         statuses = self._database.history(*place, "status", STATUSES)
-        accepted = max((s["t_utc_ns"] for s in statuses if _ACCEPTED.match(s["reason"])), default=0)
+        accepted = _newest(statuses, _accepts) or 0
         from_then = [c for c in history if c["t_utc_ns"] >= accepted] or history[-1:]
         first, last = from_then[0], history[-1]
         ends = self._with_budget(place, first), self._with_budget(place, last)
-        held = _lasting(statuses) if statuses and statuses[-1]["status"] == "HELD" else None
+        held = _held_since(statuses)
         windows = self._database.history(*place, "window", WINDOWS) if verdicts or held is not None else []
-        fitted = sorted([c["t_utc_ns"] for c in history] + [w["t_utc_ns"] for w in windows if w["used"]])
+        fitted = _used_times(history, windows)
         found = {v["parameter"]: _trend(v, from_then, ends, fitted) for v in verdicts}
         begun = [trend["began_utc_ns"][0] for trend in found.values()] + ([] if held is None else [held])
-        year = [c for c in history if c["t_utc_ns"] > last["t_utc_ns"] - YEAR_DAYS * DAY_NS]
-        shown = [year[k] for k in _thinned(len(year))]
-        return {
-            "t_utc_ns": [c["t_utc_ns"] for c in shown],
-            "main_pct": [[_pct(first, c, i) for c in shown] for i in MAIN],
+        shown = _plotted(history, first) | {
             "accepted": accepted > 0,
             "accepted_utc_ns": first["t_utc_ns"],
             "changes": [change_of(*ends, i) for i in range(len(PARAMETERS))],
             "budget": {source: [u[i] for i in MAIN] for source, u in ends[1].get("budget", {}).items()},
             "held_utc_ns": _lasting(statuses),
-            "adopted_utc_ns": max(
-                (t for s in statuses if _adopts(s) and (t := s["t_utc_ns"]) >= accepted), default=None
-            ),
+            "adopted_utc_ns": _adopted_since(statuses, accepted),
             "certificate_utc_ns": _certificate_since(history),
             "found": found,
             "beside": self._fleet.beside(place, min(begun, default=0)),
-        } | ({} if held is None else self._beyond(place, held, first, last, windows))
+        }
+        return shown if held is None else shown | self._beyond(place, held, first, last, windows)
 
     def _beyond(
         self,
@@ -159,6 +154,42 @@ def _certificate_since(history: Sequence[Mapping[str, Any]]) -> int | None:
     own = _certificates(history[-1])
     same = [c["t_utc_ns"] for c in history if _certificates(c) == own]
     return same[0] if any(own) else None
+
+
+def _plotted(history: Sequence[Mapping[str, Any]], first: Mapping[str, Any]) -> dict[str, Any]:
+    """The main sensitivities of the newest year, thinned, as changes since the calibration `first`."""
+    year = [c for c in history if c["t_utc_ns"] > history[-1]["t_utc_ns"] - YEAR_DAYS * DAY_NS]
+    shown = [year[k] for k in _thinned(len(year))]
+    return {
+        "t_utc_ns": [c["t_utc_ns"] for c in shown],
+        "main_pct": [[_pct(first, c, i) for c in shown] for i in MAIN],
+    }
+
+
+def _newest(statuses: Sequence[Mapping[str, Any]], is_so: Callable[[Mapping[str, Any]], bool]) -> int | None:
+    """When a status came last for which `is_so` holds; None where there is none."""
+    return max((status["t_utc_ns"] for status in statuses if is_so(status)), default=None)
+
+
+def _used_times(history: Sequence[Mapping[str, Any]], windows: Sequence[Mapping[str, Any]]) -> list[int]:
+    """The times of calibrations and of windows that were used, in order."""
+    return sorted([c["t_utc_ns"] for c in history] + [w["t_utc_ns"] for w in windows if w["used"]])
+
+
+def _held_since(statuses: Sequence[Mapping[str, Any]]) -> int | None:
+    """Since when the status is HELD; None where it is another."""
+    return _lasting(statuses) if statuses and statuses[-1]["status"] == "HELD" else None
+
+
+def _accepts(status: Mapping[str, Any]) -> bool:
+    """Whether an operator accepted an estimate, or went back to an earlier one."""
+    return _ACCEPTED.match(status["reason"]) is not None
+
+
+def _adopted_since(statuses: Sequence[Mapping[str, Any]], accepted_utc_ns: int) -> int | None:
+    """When a jump last came into force, if that was not before the calibration was accepted."""
+    newest = _newest(statuses, _adopts)
+    return newest if newest is not None and newest >= accepted_utc_ns else None
 
 
 def _lasting(statuses: Sequence[Mapping[str, Any]]) -> int | None:

@@ -201,19 +201,28 @@ def _first_row(split: Sequence[tuple[int, list[str]]], enough: Callable[[Sequenc
     A line of the head may have values too: it has words where other lines have none, and names follow it soon.
     """
     rows = [fields for _, fields in split]
-    worded = Counter(k for fields in rows if enough(fields) for k in _words_in(fields))
-    usual = {k for k, count in worded.items() if 2 * count > sum(map(enough, rows))}
-    after = 0
+    usual, after = _usual_words(rows, enough), 0
     for k in range(len(rows)):
         if k < after or not all(enough(row) for row in rows[k : k + 2]):
             continue
         soon = rows[k : k + HEAD_ROWS]
-        named = next((n for n, row in enumerate(soon) if len(_words_in(row)) > 1 and not any(map(_is_value, row))), 0)
+        named = next((n for n, row in enumerate(soon) if _names_columns(row)), 0)
         if named and all(_words_in(row) - usual for row in soon[:named]):
             after = k + named
             continue
         return k
     return None
+
+
+def _usual_words(rows: Sequence[list[str]], enough: Callable[[Sequence[str]], bool]) -> set[int]:
+    """The fields that are words in most of the lines that have enough values."""
+    worded = Counter(k for fields in rows if enough(fields) for k in _words_in(fields))
+    return {k for k, count in worded.items() if 2 * count > sum(map(enough, rows))}
+
+
+def _names_columns(fields: Sequence[str]) -> bool:
+    """Whether a line has several words and no value."""
+    return len(_words_in(fields)) > 1 and not any(map(_is_value, fields))
 
 
 def _words_in(fields: Sequence[str]) -> set[int]:
@@ -249,14 +258,20 @@ def _of_rows(
     head = tuple(lines[: first_line - 1])
     cells = [[row[k] for row in rows if len(row) > k and row[k].lower() not in MISSING] for k in range(width)]
     moments = tuple(map(_moments, cells))
-    days = [day_of(cell) for k in range(width) if moments[k] in ("day", "both") for cell in cells[k] if has_day(cell)]
-    fortran = any(_FORTRAN.fullmatch(cell.replace(",", ".")) for column in cells for cell in column)
+    days = _days(cells, moments)
+    fortran = any(_FORTRAN.fullmatch(cell.replace(",", ".")) for cell in itertools.chain.from_iterable(cells))
     return Dialect(
         encoding, delimiter, tuple(_comma(column) for column in cells), header, header_line, units, first_line,
         moments, _parts(header, units, moments, cells),
         order or order_in(" ".join(head)) or order_of(days), _rate_hz(head), fortran,
         frozenset(map(str.strip, head)), lines[header_line - 1].strip() if before and lines else "",
     )  # fmt: skip
+
+
+def _days(cells: Sequence[list[str]], moments: Sequence[str]) -> list[str]:
+    """The days in the columns that have some."""
+    dated = [column for column, kind in zip(cells, moments, strict=True) if kind in ("day", "both")]
+    return [day_of(cell) for column in dated for cell in column if has_day(cell)]
 
 
 def _named(fields: list[str], width: int) -> list[str] | None:

@@ -62,30 +62,48 @@ class GroundMotion(Arrays):
         assert isinstance(grid, Grid | Stretches)
         columns = [c for c in source.seed_ids if c.group == time.group]
         found = [station.component(source.seed_ids[c], grid.start_s, grid.rate_hz) for c in columns]
-        self.said += [
-            f"{station.path}, channel {component.seed_id}: the stages of the response differ from the overall "
-            f"sensitivity by {100.0 * component.inconsistent:.3g} %; the overall sensitivity is used"
-            for component in found
-            if abs(component.inconsistent) > CONSISTENT
-        ]
+        self.said += _inconsistent(station, found)
         flat = [
             DeconvolvedSamples(source.values[c], grid.rate_hz, each) for c, each in zip(columns, found, strict=True)
         ]
+        whole = len(found) == len(AXES)
         if role == "sensor":
-            names = _axes(found) if len(found) == len(AXES) else [c.name for c in columns]
-            told = {Column(n, "counts", time.group): (f, c) for n, f, c in zip(names, flat, found, strict=True)}
-            self.components |= {column: component for column, (_, component) in told.items()}
-            return {time: grid} | {column: samples for column, (samples, _) in told.items()}
-        if len(found) != len(AXES):
-            names = ["a"] if len(found) == 1 else [c.name for c in columns]
-            return {time: grid} | self._each(names, time.group, found, flat)
+            names = _axes(found) if whole else [c.name for c in columns]
+            return {time: grid} | self._counts(names, time.group, found, flat)
+        if whole:
+            return {time: grid} | self._east_north_up(station, time.group, found, flat)
+        names = ["a"] if len(found) == 1 else [c.name for c in columns]
+        return {time: grid} | self._each(names, time.group, found, flat)
+
+    def _counts(
+        self, names: Sequence[str], group: str, found: Sequence[StationChannel], flat: Sequence[DeconvolvedSamples]
+    ) -> dict[Column, Slices]:
+        """Each channel by itself in counts."""
+        columns = [Column(name, "counts", group) for name in names]
+        self.components |= dict(zip(columns, found, strict=True))
+        return dict(zip(columns, flat, strict=True))
+
+    def _east_north_up(
+        self, station: StationXml, group: str, found: Sequence[StationChannel], flat: Sequence[DeconvolvedSamples]
+    ) -> dict[Column, Slices]:
+        """Three channels as accelerations along east, north and up."""
         turned = _turned(station, found) / [c.sensitivity for c in found]
-        whole: dict[Column, Slices] = {time: grid}
+        samples: dict[Column, Slices] = {}
         for name, weights, (azimuth, dip) in zip(AXES, turned, EAST_NORTH_UP, strict=True):
-            column = Column(name, "m/s2", time.group)
-            whole[column] = Sum(flat, weights.tolist())
+            column = Column(name, "m/s2", group)
+            samples[column] = Sum(flat, weights.tolist())
             self.components[column] = msgspec.structs.replace(found[0], azimuth_deg=azimuth, dip_deg=dip)
-        return whole
+        return samples
+
+
+def _inconsistent(station: StationXml, found: Sequence[StationChannel]) -> list[str]:
+    """What is said of channels whose stages do not give the overall sensitivity."""
+    return [
+        f"{station.path}, channel {component.seed_id}: the stages of the response differ from the overall "
+        f"sensitivity by {100.0 * component.inconsistent:.3g} %; the overall sensitivity is used"
+        for component in found
+        if abs(component.inconsistent) > CONSISTENT
+    ]
 
 
 class DeconvolvedSamples:

@@ -59,19 +59,22 @@ class Gone:
         entries = [entry for entry in self.deleted if entry.first - 1 <= number <= entry.last + 1]
         if first_outside(entries, number, number) is not None:
             return self._stated_alone(number), ("" if self.whole else NOT_GIVEN)
-        epochs = {entry.epoch for entry in entries if entry.first <= number <= entry.last and entry.epoch}
+        epochs = {entry.epoch for entry in entries if entry.first <= number <= entry.last} - {""}
         if said.epoch and epochs and said.epoch not in epochs:
             return f"recording {number} of the epoch {said.epoch}, which this head names, is not there", ""
-        own = [entry for entry in self.listed if entry.first == number and entry.epoch == said.epoch]
-        if head.closed:
-            digests = self._digests(entries, number) | {entry.sha256 for entry in own}
-            named, unknown = said.sha256, OLDER
-        else:
-            digests = self._digests(entries, number - 1) | {entry.previous_sha256 for entry in own}
-            named, unknown = said.previous_sha256, OPEN
+        named, unknown = (said.sha256, OLDER) if head.closed else (said.previous_sha256, OPEN)
+        digests = self._digests_beside(entries, head)
         if named and digests - {"", named}:
             return f"the deleted recording {number} was not the one that this head names: its SHA-256 differs", ""
         return "", ("" if head.closed and named in digests else unknown)
+
+    def _digests_beside(self, entries: Iterable[Deleted], head: Head) -> set[str]:
+        """All SHA-256 that are said of the recording of a closed head, otherwise of the one before it."""
+        said, number = head.statement, head.statement.file_sequence
+        of_head = [entry for entry in self.listed if entry.first == number and entry.epoch == said.epoch]
+        if head.closed:
+            return self._digests(entries, number) | {entry.sha256 for entry in of_head}
+        return self._digests(entries, number - 1) | {entry.previous_sha256 for entry in of_head}
 
     def _digests(self, entries: Iterable[Deleted], number: int) -> set[str]:
         """All SHA-256 that are said of a recording by its neighbours and by what is said of them."""

@@ -174,20 +174,13 @@ class Recorder:
         Returns whether the event is in a file. If so, and if there are results, the event, its results and all events
         before it survive a power cut.
         """
-        log_time, publish_time = self._stamp(event)
+        times = self._stamp(event)
         try:
             messages = [(topic_of(item), self.results.encode(event_sequence, item)) for item in (event, *results)]
             if isinstance(event, RunStart):
                 self._begin(event)
-            if isinstance(event, Pruned) and self._file is not None:
-                self._repeat([Deleted.of(event)])
             if self._file is not None:
-                for topic, data in messages:
-                    self._file.append(topic, data, log_time, publish_time, event_sequence)
-                if isinstance(event, Pruned):
-                    self._file.note(PRUNED_METADATA, to_metadata(self._pruned, self._list.text))
-                if results or isinstance(event, RunStart | Pruned):
-                    self._file.sync()
+                self._append(self._file, event_sequence, event, messages, times)
             if isinstance(event, RunStart):
                 self._begun(event)
             if isinstance(event, Pruned):
@@ -204,6 +197,20 @@ class Recorder:
             self.close()
             self._fail(f"event {event_sequence} cannot be recorded: {error}")
         return self.recording
+
+    def _append(
+        self, file: RecordingFile, event_sequence: int, event: Event, messages: Sequence[tuple[str, bytes]],
+        times: tuple[int, int],
+    ) -> None:  # fmt: skip
+        """Append an event and its results; what must be on the disk before the run goes on is there at the return."""
+        if isinstance(event, Pruned):
+            self._repeat([Deleted.of(event)])
+        for topic, data in messages:
+            file.append(topic, data, *times, event_sequence)
+        if isinstance(event, Pruned):
+            file.note(PRUNED_METADATA, to_metadata(self._pruned, self._list.text))
+        if len(messages) > 1 or isinstance(event, RunStart | Pruned):
+            file.sync()
 
     def sync(self) -> None:
         """Write all recorded events to the disk; fast where none waits."""

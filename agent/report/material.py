@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -31,6 +31,8 @@ from agent.report.result import (
 )
 from agent.report.retraced import retrace
 from agent.report.trace import Trace
+
+Kind = TypeVar("Kind")
 
 LARGEST_RESULT = 64 << 20  # bytes of a RESULT.json, which lists all its windows
 MOST_HISTORY = 1000  # newest calibrations and windows of a data directory
@@ -138,13 +140,12 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
         status = next(iter(history.newest(chosen, "status", limit=1)), None)
         shown = [*kept, *seen, *(record for record in (in_force, status) if record is not None)]
         said = evidence(history, shown, directory)
-    windows = [_verdict(w.result) for w in seen if isinstance(w.result, WindowReport)]
+    windows = [_verdict(report) for report in _results(seen, WindowReport)]
     wanted = list(dict.fromkeys(w.recording for w in seen if w.fields.get("used")))
     paths, lost = _present(directory, wanted[-MOST_RECORDINGS:])
     recorded = read_recordings(paths, chosen) if paths else RecordedSensor(chosen)
-    recorded.status = status.result if status and isinstance(status.result, StatusChange) else recorded.status
-    updates = [record.result for record in kept if isinstance(record.result, CalibrationUpdate)]
-    newest = [in_force.result] if in_force and isinstance(in_force.result, CalibrationUpdate) else []
+    recorded.status = next(iter(_results([status], StatusChange)), recorded.status)
+    newest = _results([in_force], CalibrationUpdate)
     missing, facts = list[str](), dict[str, Any]()
     if newest and not newest[0].budget:
         try:
@@ -154,13 +155,18 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
     material = _of(recorded, windows, newest)
     material.notices += missing
     material.facts |= facts
-    material.history = updates
+    material.history = _results(kept, CalibrationUpdate)
     material.files = [source_file(path) for path in paths]
     material.notices += said
     material.notices += [
         f"the recording {name} does not exist any more, so its windows are not shown point by point" for name in lost
     ]
     return material
+
+
+def _results(records: Iterable[StoredResult | None], kind: type[Kind]) -> list[Kind]:
+    """The results of this kind in the records."""
+    return [record.result for record in records if record is not None and isinstance(record.result, kind)]
 
 
 def _run_of(history: History, sensor: str, in_force: StoredResult | None) -> str:

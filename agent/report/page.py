@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.resources import files
 
 from agent import __version__
@@ -79,26 +79,27 @@ def _numbers(material: Material, seen: Sequence[Residuals]) -> Iterator[str]:
     for result in material.results:
         about = f", {page_text(result.label)}" if len(material.results) > 1 else ""
         yield f"<h2>Numbers{about}</h2>"
-        if result.determined.any():
-            yield "<h3>Parameters</h3>" + tables.parameters(result.shown)
-        if result.frequencies.bands:
-            yield "<h3>Main sensitivities over frequency, with U</h3>" + tables.over_frequency(result.shown)
-        if result.budget and result.determined.any():
-            yield "<h3>Uncertainty budget: u by source</h3>" + tables.budget(result.shown)
-        if result.fields.get("nuisances"):
-            yield "<h3>Nuisances</h3>" + tables.nuisances(result)
-        if statistics := result.fields.get("statistics"):
-            yield "<h3>Statistics (Appendix A)</h3>" + tables.statistics(statistics)
-        if result is material.results[0] and seen:
-            yield "<h3>Residuals, root mean square</h3>" + tables.left_over(seen, result)
-        if result.windows:
-            yield "<h3>Windows</h3>" + tables.windows(result)
-        if options := tables.facts(result.fields.get("options") or {}):
-            yield "<h3>Options</h3>" + options
-        if more := tables.facts(result.more):
-            yield "<h3>Further</h3>" + more
-        if result.determined.any():
-            yield "<h3>Covariance</h3>" + tables.covariance(result.shown)
+        for heading, there, table in _tables_of(result, seen if result is material.results[0] else ()):
+            if there and (content := table()):
+                yield f"<h3>{heading}</h3>{content}"
+
+
+def _tables_of(result: CalibrationResult, seen: Sequence[Residuals]) -> list[tuple[str, bool, Callable[[], str]]]:
+    """Heading, whether there is anything to show, and what makes it."""
+    fields, determined = result.fields, bool(result.determined.any())
+    return [
+        ("Parameters", determined, lambda: tables.parameters(result.shown)),
+        ("Main sensitivities over frequency, with U", bool(result.frequencies.bands),
+         lambda: tables.over_frequency(result.shown)),
+        ("Uncertainty budget: u by source", bool(result.budget) and determined, lambda: tables.budget(result.shown)),
+        ("Nuisances", bool(fields.get("nuisances")), lambda: tables.nuisances(result)),
+        ("Statistics (Appendix A)", bool(fields.get("statistics")), lambda: tables.statistics(fields["statistics"])),
+        ("Residuals, root mean square", bool(seen), lambda: tables.left_over(seen, result)),
+        ("Windows", bool(result.windows), lambda: tables.windows(result)),
+        ("Options", True, lambda: tables.facts(fields.get("options") or {})),
+        ("Further", True, lambda: tables.facts(result.more)),
+        ("Covariance", determined, lambda: tables.covariance(result.shown)),
+    ]  # fmt: skip
 
 
 def _origin(material: Material) -> Iterator[str]:

@@ -62,16 +62,10 @@ class ChosenDevice:
 
 def listen(devices: list[ChosenDevice], asking: Interview) -> None:
     """Listen to the devices that write lines of text or send datagrams, as far as their options are not all stated."""
-    waiting = []
     for device in devices:
         if device.driver.value == SHAKE and "channels" not in device.options:
             _hear_shake(device, asking)
-        if device.driver.value != TEXT_LINES or not device.value("port"):
-            continue
-        if columns := _stated_columns(device):
-            _state_columns(device, columns, f"option --{device.role}-option")
-        if not columns or "rate_hz" not in device.options:
-            waiting.append(device)
+    waiting = [device for device in devices if _sends_lines(device) and not _is_stated(device)]
     ports = {str(device.value("port")): int(device.value("baud_rate") or BAUD_RATE) for device in waiting}
     heard = hear(ports) if ports else {}
     for device in waiting:
@@ -89,6 +83,17 @@ def listen(devices: list[ChosenDevice], asking: Interview) -> None:
             device.state("rate_hz", told.nominal_hz, f"counted on the port: {told.counted_hz:.4g} Hz")
             if columns := _columns(device, told, asking):
                 _state_unit(device, columns, told, asking.faults)
+
+
+def _sends_lines(device: ChosenDevice) -> bool:
+    return device.driver.value == TEXT_LINES and bool(device.value("port"))
+
+
+def _is_stated(device: ChosenDevice) -> bool:
+    """Whether columns and rate of the lines are stated, as the columns are from now on where the options tell them."""
+    if columns := _stated_columns(device):
+        _state_columns(device, columns, f"option --{device.role}-option")
+    return bool(columns) and "rate_hz" in device.options
 
 
 def _ask(device: ChosenDevice) -> bool:

@@ -36,7 +36,7 @@ class IioRig(Rig):
         options = IioOptions.model_validate({"device": "twin345", "rate_hz": self.rate_hz} | changes)
         return Iio("sensor", options, clock=self.clock, sleep=lambda s: self.sleep(s))
 
-    def build_elsewhere(self) -> Iio:
+    def build_elsewhere(self) -> Iio:  # type: ignore[override]
         return self.build(device="other")
 
     def counts(self, first: int, n: int) -> NDArray[np.int32]:
@@ -102,7 +102,7 @@ class TestIio(SensorContract):
     def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[IioRig]:
         yield from installed(IioRig(tmp_path), monkeypatch)
 
-    def test_polls_do_not_beat_with_the_sample_clock(self, rig: IioRig) -> None:
+    def test_polls_do_not_beat_with_the_sample_clock(self, rig: IioRig) -> None:  # type: ignore[override]
         """Replaced, because the kernel stamps every sample and no poll can beat with the sample clock."""
         rig.open()
         for block in rig.blocks(1.0):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hw.block import BlockFlags, Drop
+from hw.block import BlockFlags, Drop, SampleBlock
 from hw.conformance.network import NetworkRig
 from hw.conformance.sensor import EPOCH_NS, SensorContract
 from hw.message_sensor import OUTSIDE
@@ -101,7 +101,7 @@ class TestMqtt(SensorContract):
         yield rig
         rig.close()
 
-    def test_arrivals_are_late_by_less_than_a_sample(self, rig: MqttRig) -> None:
+    def test_arrivals_are_late_by_less_than_a_sample(self, rig: MqttRig) -> None:  # type: ignore[override]
         """Replaced, because a message comes when it is full: its last sample must exist, and is at most a poll old."""
         rig.open()
         for block in rig.blocks(2.0):
@@ -110,7 +110,7 @@ class TestMqtt(SensorContract):
             assert (late_s >= 0).all()
             assert (late_s <= 0.0301).all()
 
-    def test_polls_do_not_beat_with_the_sample_clock(self, rig: MqttRig) -> None:
+    def test_polls_do_not_beat_with_the_sample_clock(self, rig: MqttRig) -> None:  # type: ignore[override]
         """Replaced, because only every 100th sample comes by itself: some messages are read at once in each second."""
         rig.open()
         blocks = list(rig.blocks(1.0))
@@ -268,7 +268,7 @@ def test_a_real_broker_with_a_password_comes_and_goes(tmp_path: Path) -> None:
             publisher.publish(TOPIC, bytes(2_000_000))  # the broker keeps to the limit that it was told
             while publisher.want_write():
                 publisher.loop(0.01)
-            blocks = []
+            blocks = list[SampleBlock]()
             while sum(block.n for block in blocks) < 600:
                 block = sensor.read_block()
                 assert block is not None

@@ -84,8 +84,8 @@ def test_init_finds_both_and_run_calibrates(tmp_path: Path) -> None:
         assert fieldcal("check", path).returncode == 0
         with started("run", path, "--data-dir", data_dir, output=tmp_path / "output") as agent:
             wait_until(
-                lambda: [s for s in results(data_dir, "status") if s["status"] == "VALID"], 120, "VALID"
-            )  # a window of 60 s
+                lambda: [s for s in results(data_dir, "status") if s["status"] == "VALID"], 400, "VALID"
+            )  # a window of 60 s; where samples are lost on a busy machine, another one
             interrupt(agent)
     found = results(data_dir, "calibration")[-1]
     s = np.reshape(found["sensitivity"], (3, 3))
@@ -110,7 +110,7 @@ def test_init_finds_a_velocity_reference(tmp_path: Path, monkeypatch: pytest.Mon
 def test_a_sensor_at_another_baud_rate_and_a_port_without_one(tmp_path: Path) -> None:
     with plugged(tmp_path, epson=epson()) as (port,):
         # A pseudo-terminal has no baud rate: the first one that is tried answers, or the one that is stated.
-        found = recognised(port, 115200)
-        assert found is not None
+        # It waits 0.1 s for an answer, and this test's own process, which answers, may get no processor for so long.
+        found = wait_until(lambda: recognised(port, 115200), 60, "an answer")
         assert (found.driver, found.options) == ("epson", {"baud_rate": 115200, "unit": "g"})
     assert recognised(str(tmp_path / "none")) is None

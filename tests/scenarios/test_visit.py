@@ -19,12 +19,19 @@ SEED = 2
 @pytest.mark.slow
 def test_two_visits_with_a_turned_and_a_loose_clamp(tmp_path):
     """Each wrong clamp is named; then S of both sensors is right within its U, and one reference's error is shared."""
-    answers = iter(["turned", "", "loose", ""])
+    answers, last = iter(["turned", "", "loose", ""]), ""
+
+    def answer(told: str) -> str:
+        nonlocal last
+        if "no samples of" not in told:  # on a busy machine the same is measured anew
+            last = next(answers, "q")
+        return last
+
     out, told_json = tmp_path / "out", tmp_path / "all.json"
     status, told = led(
         ["visit", "--data-dir", str(out), "--json", str(told_json), "--seed", str(SEED), "--u-pct", "0.5",
          "--sensor", "sensor-1", "--sensor", "sensor-3"],
-        lambda _: next(answers, "q"),
+        answer,
     )  # fmt: skip
     assert status == 0, told
     first, second = told.split("visit 2 of 2")

@@ -30,6 +30,7 @@ class Watched:
         self.address = address
         self.context = browser.new_context(**options)
         self.page = self.context.new_page()
+        self.page.set_default_timeout(60_000)  # ms; what a test waits for comes late on a busy machine
         self.asked: list[str] = []
         self.errors: list[str] = []
         self.page.on("request", lambda request: self.asked.append(request.url))

@@ -121,7 +121,7 @@ def test_what_is_in_it(package: Path, tmp_path: Path) -> None:
 def test_a_package_without_a_text_of_its_licence_is_named(tmp_path: Path) -> None:
     site = installed(tmp_path, "python")
     (site / "part-1.0.dist-info/licenses/LICENSE").unlink()
-    command = [sys.executable, ROOT / "deploy/licences/licences.py", site]
+    command = [sys.executable, str(ROOT / "deploy/licences/licences.py"), str(site)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (1, "")
     assert "no text of a licence: part 1.0" in done.stderr

@@ -99,7 +99,7 @@ def test_a_drawn_bench_is_within_4_u(seed: int) -> None:
 
 @pytest.mark.thorough
 def test_few_of_60_benches_are_refused_or_beyond_4_u() -> None:
-    """The numbers are those of the code that this was written for, with a margin; chance alone gives 0.05 beyond 4 u."""
+    """The limits are what was seen, with a margin: by chance alone 0.05 of them would be beyond 4 u."""
     largest = [beyond(seed) for seed in range(8, 68)]
     told = np.array([one for one in largest if one is not None])
     assert len(told) >= 57

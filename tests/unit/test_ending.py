@@ -1,4 +1,4 @@
-"""A process ends after its exit handlers and before the interpreter is finalised."""
+"""A program is told to stop, and ends after its exit handlers and before the interpreter is finalised."""
 
 from __future__ import annotations
 
@@ -68,6 +68,29 @@ def test_status_and_all_that_belongs_to_an_exit(end: str, status: int) -> None:
     told = ended(ENDS.replace("{end}", end))
     assert (told.returncode, told.stdout) == (status, "thread\nhandler\n")
     assert ("Traceback" in told.stderr) == (status == 1)
+
+
+@pytest.mark.parametrize(
+    "waits", ["atexit.register(threading.Event().wait)", "threading.Thread(target=threading.Event().wait).start()"]
+)
+def test_what_waits_for_ever_ends_with_the_process(waits: str) -> None:
+    told = ended(ENDS.replace("{end}", f"{waits}; ending.status = 0; ending.within(0.5)"))
+    assert (told.returncode, told.stderr) == (0, "")
+
+
+def test_a_signal_sets_a_stop_request_whatever_it_interrupts() -> None:
+    """A signal comes at each call in `wait`: an event of `threading` would wait there for a lock of its own thread."""
+    told = ended("""
+import signal, sys
+from agent.delivery.ending import StopRequest
+stop = StopRequest.by_signals()
+assert not stop.is_set()
+sys.setprofile(lambda *_: signal.raise_signal(signal.SIGTERM))
+waited = stop.wait(0.1)
+sys.setprofile(None)
+print(waited, stop.is_set(), stop.wait())
+""")
+    assert (told.returncode, told.stdout, told.stderr) == (0, "True True True\n", "")
 
 
 def test_output_that_cannot_be_written_is_no_success() -> None:

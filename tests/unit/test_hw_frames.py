@@ -85,7 +85,7 @@ pieces = st.lists(
 
 def plain_reading(data: bytes) -> tuple[list[int], int]:
     """Ends of the frames, and the position from which the bytes may still become a frame."""
-    ends, at = [], 0
+    ends, at = list[int](), 0
     while at < len(data):
         whole = data[at : at + 6]
         if len(whole) < 6 and (whole.startswith(b"\xaa\x55") or whole == b"\xaa"):

@@ -36,7 +36,8 @@ def calibrated(sensor: Path, reference: Path, count: int) -> float:
 @pytest.fixture(autouse=True)
 def _one_thread_of_arrow(monkeypatch: pytest.MonkeyPatch) -> None:
     """What several threads hold at once depends on what else the machine does."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # of those that compute
+    monkeypatch.setenv("ARROW_IO_THREADS", "1")
 
 
 @pytest.mark.thorough

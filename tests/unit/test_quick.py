@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 
 from tests.quick import LIMIT_S, MOST_S, Quick
 
 
-def report(nodeid: str, when: str, taken_s: float) -> pytest.TestReport:
+def report(nodeid: str, when: Literal["setup", "call", "teardown"], taken_s: float) -> pytest.TestReport:
     return pytest.TestReport(nodeid, ("", 0, ""), {}, "passed", None, when, user_properties=[("cpu_s", taken_s)])
 
 

@@ -36,6 +36,19 @@ def test_it_says_its_real_endpoint_and_ends_within_a_second(ending: signal.Signa
     assert not router_running(endpoint)
 
 
+def test_it_ends_while_somebody_has_connected_and_says_nothing() -> None:
+    """Zenoh itself would close in 10 s, and with an error."""
+    router = router_process("--listen", "tcp/127.0.0.1:0")
+    assert router.stdout is not None
+    port = int(router.stdout.readline().rsplit(":", 1)[1])
+    with socket.create_connection(("127.0.0.1", port)):
+        begin = time.monotonic()
+        router.send_signal(signal.SIGTERM)
+        _, faults = router.communicate(timeout=60)
+    assert time.monotonic() - begin < 5.0  # 1.0 s on a quiet machine
+    assert (router.returncode, faults) == (0, "")
+
+
 def test_it_may_open_as_many_files_as_the_system_allows() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))

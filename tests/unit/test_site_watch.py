@@ -303,14 +303,15 @@ def test_hours_are_merged_without_their_levels_and_without_noise() -> None:
     power = np.exp(2.0 * (own + level)) + 1e-3 * width
     cross = 0.3 * np.exp(own + level)[..., [0, 0, 1]] * np.exp(own + level)[..., [1, 2, 2]]
     power[3:9, 2], power[5, 1] = np.nan, 1e6  # hours without a sensor; a blow at another
-    day = day_of(Hours(24 * 20_000 + np.arange(24), power, cross, psd, np.full((24, n), 12.0)), BANDS_HZ)
+    hour = 24.0 * 20_000 + np.arange(24.0)
+    day = day_of(Hours(hour, power, cross, psd, np.full((24, n), 12.0)), BANDS_HZ)
     assert day.number == 20_000
     assert day.temperature_degc == 12.0
     away = day.value[..., :3] - own
     assert np.allclose(away - away[:1], 0.0, atol=1e-9), "the same for all sensors: the level"
     assert np.allclose(np.delete(day.value[..., 3:], 1, axis=0), 0.3, atol=1e-9)
     power[:, 0, 0] = 3.0 * 1e-3 * width[0]  # the signal has twice the noise
-    quiet = day_of(Hours(24 * 20_000 + np.arange(24), power, cross, psd, np.full((24, n), np.nan)), BANDS_HZ)
+    quiet = day_of(Hours(hour, power, cross, psd, np.full((24, n), np.nan)), BANDS_HZ)
     assert np.isnan(quiet.value[0, 0]).all()
     assert np.isinf(quiet.u[0, 0]).all()
     assert np.isfinite(quiet.value[0, 1:]).all()

@@ -119,7 +119,7 @@ def test_another_place_that_fits_after_a_loss_is_left_again() -> None:
     """Bytes are lost until the place that was taken is one at which the frames fit, too. Their counter does not."""
     frames = [bytes([0x80, 3 * k % 256, 0x80, k * k % 251, 7]) for k in range(90)]
     for piece in (7, 1000):
-        search, rest, found = UncheckedFrames(Layout(b"\x80", 5), counter), b"", []
+        search, rest, found = UncheckedFrames(Layout(b"\x80", 5), counter), b"", list[bytes]()
         data = b"".join(frames[:40]) + b"".join(frames[45:])[2:]
         for at in range(0, len(data), piece):
             new = search.find(rest + data[at : at + piece])

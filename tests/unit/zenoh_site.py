@@ -23,10 +23,8 @@ KEY = "fieldcal/v1/site/gw"
 
 def router_process(*options: str) -> subprocess.Popen[str]:
     """`fieldcal router` in a process of its own."""
-    command = "import sys; from agent.cli.router import router; sys.exit(router(sys.argv[1:], standalone_mode=False))"
-    return subprocess.Popen(
-        [sys.executable, "-c", command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    command = [sys.executable, "-m", "agent", "router", *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 class Site:
