@@ -197,6 +197,8 @@ def _result(
     to_error = contextlib.redirect_stdout(sys.stderr) if options["apart"] else contextlib.nullcontext()
     with to_error:
         made(parsed(arguments), output, options["stated"])
+    if not (output / "result.json").exists():  # the samples themselves could not be read; calibrate has said why
+        return told | {"status": "refused", "reasons": [f"fieldcal calibrate does not take the samples in {output}"]}
     result = json.loads((output / "result.json").read_text())
     stayed_s = visited.taken.stop_s - visited.taken.start_s
     told |= result | {"stayed_s": stayed_s, "promised_s": visited.promised_s}
