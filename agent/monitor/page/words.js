@@ -87,7 +87,7 @@ export function covered(row, trends) {
 // How sure the first verdict is, and its size where that is less sure.
 function often(row, trends) {
   const [verdict] = row.verdicts, { size, u_size, unit, factor } = finding(verdict, trends?.found?.[verdict.parameter]), years = 1 / verdict.false_alarms_a_year, U = 2 * u_size * factor;
-  const told = finite(years) && years > 0 ? `A sound sensor is told so once in ${two(years)} years at most. ` : "";
+  const told = finite(years) && years > 0 ? `A sound sensor gives such a false alarm once in ${two(years)} years at most. ` : "";
   return U > Math.abs(size * factor) ? `${told}How far it has changed is less sure: U of the change is ± ${two(U)}${unit}. ` : told;
 }
 
@@ -155,7 +155,7 @@ const ON_HOLD = /^put on hold by/;
 
 // {say, more} of a sensor that is held, perhaps with a step.
 function heldWords(row, verdicts, trends) {
-  const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), ": "], why = explanation(row.reason);
+  const since = ["Held since ", make("b", moment(trends?.held_utc_ns ?? row.status_utc_ns)), verdicts.length ? ". Seen from its reference: " : ": "], why = explanation(row.reason);
   const reason = why ? [`${why.held} windows ${why.agree ? "agree with what the calibration may have become." : "contradict the calibration."}`] : [row.reason, "."];
   return { say: [...since, ...(verdicts.length ? inTurn(verdicts) : reason)], more: [...(why ? [...inWords(why), " "] : verdicts.length ? [...reason, " "] : []), ON_HOLD.test(row.reason) ? "" : `${isContradicted(why, trends) ? "But " : ""}${witnessed(trends?.beside)}`] };
 }
