@@ -243,10 +243,9 @@ def _slide_terms(poses: Sequence[Pose], priors: Priors) -> Iterator[Term]:
             setups.setdefault(_setup(pose), []).append(p)
         elif own_channels(pose.direction.shape[1]) == 1:
             free.append(p)
-    for number, (setup, alike) in enumerate(setups.items()):  # the name of the first one stays when others come
+    for setup, alike in setups.items():  # named by the pose alone: on-line each window has its own terms
         for name, way in (("lateral", lateral), ("vertical", vertical)):
-            own = f"transverse_{name}{setup if number else ''}"
-            yield from _across(own, "", priors, _only(poses, alike, way[alike]))
+            yield from _across(f"transverse_{name}{setup}", "", priors, _only(poses, alike, way[alike]))
     for p in free:
         position = poses[p].position
         for name, k in zip("ab", np.linalg.svd(poses[p].direction[:, :1])[0].T[1:], strict=True):
@@ -283,12 +282,13 @@ def _slide_frame(pose: Pose) -> tuple[Array, Array, Array] | None:
 
 def _setup(pose: Pose) -> str:
     """The name of how that stands which moves a sensor whose direction of motion is stated: by its angle to gravity, to
-    SETUP_DEG. "" on a slide, which is one thing at any inclination."""
+    SETUP_DEG. "" where the motion is horizontal, and on a slide, which is one thing at any inclination."""
     if pose.theta_rad is not None:
         return ""
     motion, gravity = pose.direction[:, 0], pose.gravity_mps2
     cosine = float(motion @ gravity) / float(np.linalg.norm(motion) * np.linalg.norm(gravity))
-    return f" at {SETUP_DEG * round(float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))) / SETUP_DEG)} deg"
+    angle_deg = SETUP_DEG * round(float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))) / SETUP_DEG)
+    return "" if angle_deg == 90 else f" at {angle_deg} deg"
 
 
 def _clamp_frame(pose: Pose) -> tuple[Array, Array]:
