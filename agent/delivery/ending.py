@@ -56,8 +56,14 @@ class StopRequest:
 
     @classmethod
     def by_signals(cls) -> StopRequest:
-        """One that SIGINT and SIGTERM set from now on."""
+        """One that SIGINT and SIGTERM set from now on. In the main thread.
+
+        The interpreter itself writes to the pipe. A handler in Python would wait for the next instruction of the main
+        thread, and where a signal comes just before that thread begins to wait, there is none.
+        """
         stop = cls()
+        os.set_blocking(stop._ends[1], False)
+        signal.set_wakeup_fd(stop._ends[1], warn_on_full_buffer=False)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         return stop

@@ -93,6 +93,21 @@ print(waited, stop.is_set(), stop.wait())
     assert (told.returncode, told.stdout, told.stderr) == (0, "True True True\n", "")
 
 
+def test_a_signal_that_another_thread_takes_stops_a_program_that_waits() -> None:
+    """No call of the main thread is interrupted, as where a signal comes just before its call begins to wait."""
+    told = ended("""
+import signal, threading, time
+from agent.delivery.ending import StopRequest
+stop = StopRequest.by_signals()
+def take():
+    time.sleep(0.2)  # until the main thread waits; before, it would notice the signal in any case
+    signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+threading.Thread(target=take).start()
+print(stop.wait(20.0))
+""")
+    assert (told.returncode, told.stdout, told.stderr) == (0, "True\n", "")
+
+
 def test_output_that_cannot_be_written_is_no_success() -> None:
     with open("/dev/full", "w") as full:
         assert ended(ENDS.replace("{end}", "ending.status = 0"), stdout=full.fileno()).returncode == 1
