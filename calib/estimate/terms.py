@@ -22,7 +22,7 @@ from calib.signal.response import ALL_POWERS, by_term
 from calib.windows.deviations import ByAxis, LeftOpen
 
 PARALLEL = 1e-3  # rad; if motion and gravity are parallel within this angle, there is no horizontal normal
-SETUP_DEG = 1  # angles between motion and gravity that are measured by hand differ by less
+SETUP_DEG = 1  # one setup is told from another by its angle between motion and gravity to so many degrees
 AXES = "xyz"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from typing import TypeVar
 
 import numpy as np
@@ -128,34 +129,37 @@ def largest_omega(windows: Sequence[Window]) -> float:
 
 
 def correlated_lag(
-    parts: Iterable[tuple[Array, Array, Array]], furthest_s: float, most_rate: float, omega: float
+    parts: Iterable[tuple[Array, Array, Array]], span_s: float, furthest_s: float, most_rate: float, omega: float
 ) -> tuple[float, float, float] | None:
     """The lag in s at which the outputs V follow the reference u best, by their cross-correlation; by how much it
     changes in a second, where the two clocks run apart; and the time in s at which it is this lag.
 
-    `parts` are stretches of evenly spaced samples: times (n,) in s, V (n, 3) and u (n, m). Lags up to `furthest_s` to
-    both sides and changes up to `most_rate` are compared; `omega` is the angular frequency of the motion in rad/s.
+    `parts` are stretches of evenly spaced samples within `span_s`: times (n,) in s, V (n, 3) and u (n, m). They are
+    taken one by one, so that those of a day need not be held. Lags up to `furthest_s` to both sides and changes up to
+    `most_rate` are compared; `omega` is the angular frequency of the motion in rad/s.
     Where several peaks are almost equally high, as in motion of one frequency, that of the slowest change counts, and
     of these the one nearest to 0. None if there is no motion. The lag is right to a sample, or to an eighth of a period
     at both ends of the parts; `without_lag` leads from there to the lag.
     """
-    cut = [piece for part in parts for piece in _pieces(*part)]
-    cut = cut[:: -(-len(cut) // MOST_PIECES)] if cut else []
-    if not cut:
+    every, reach_s = max(1, int(np.ceil(span_s / (PIECE_S * MOST_PIECES)))), furthest_s + 0.5 * most_rate * span_s
+    period_s, middles, correlations = 0.0, [], []
+    for time_s, V, u in islice((piece for part in parts for piece in _pieces(*part)), 0, None, every):
+        period_s = period_s or float(median(np.diff(time_s)))
+        middles.append(0.5 * (time_s[0] + time_s[-1]))
+        correlations.append(_correlation(V, u, int(np.ceil(reach_s / period_s)) + 1))
+    if not middles:
         return None
-    period_s = float(median(np.diff(cut[0][0])))
-    middles_s = np.array([0.5 * (time_s[0] + time_s[-1]) for time_s, *_ in cut])
+    middles_s = np.array(middles)
     at_s, half_s = 0.5 * float(middles_s[0] + middles_s[-1]), 0.5 * float(np.ptp(middles_s))
     finest = max(2.0 * period_s, np.pi / 4.0 / omega) / half_s if half_s else np.inf
     number = int(min(np.ceil(most_rate / finest), MOST_RATES))
     rates = np.linspace(-most_rate, most_rate, 2 * number + 1) if number else np.zeros(1)
     shifts = np.rint(np.outer(rates, middles_s - at_s) / period_s).astype(int)
-    size, more = int(np.ceil(furthest_s / period_s)), int(np.abs(shifts).max())
+    size = int(np.ceil(furthest_s / period_s))
     total = np.zeros((len(rates), 2 * size + 1))
-    for (_, V, u), own in zip(cut, shifts.T, strict=True):
-        correlation = _correlation(V, u, size + more)
-        for row, shift in zip(total, own.tolist(), strict=True):
-            row += correlation[more + shift : more + shift + 2 * size + 1]
+    for correlation, own in zip(correlations, shifts.T, strict=True):
+        for row, first in zip(total, (own + len(correlation) // 2 - size).tolist(), strict=True):
+            row += correlation[first : first + 2 * size + 1]
     return _slowest_peak(total, rates, period_s, at_s)
 
 

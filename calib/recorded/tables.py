@@ -126,7 +126,8 @@ class Tables:
     def likely_lag_s(self, furthest_s: float, omega: float) -> float:
         """The lag in s by cross-correlation, up to `furthest_s` to both sides; 0 without motion. `omega` is the angular
         frequency of the motion in rad/s. What the rates of the two clocks differ is corrected."""
-        found = correlated_lag(self._stretches(), furthest_s, MOST_RATE, omega)
+        first_s, end_s = self._sensor.span_s
+        found = correlated_lag(self._stretches(), end_s - first_s, furthest_s, MOST_RATE, omega)
         if found is None or self._reference is None:
             return 0.0
         lag_s, rate, at_s = found

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
-from calib.excitation.lag_search import longest_in_time, minima, misfit_by_lag
+from calib.excitation.lag_search import correlated_lag, longest_in_time, minima, misfit_by_lag
 
 RATE_HZ, SECONDS, NOISE = 100.0, 40.0, 0.05
 S = np.array([[2.0, 0.02, -0.01], [0.01, 1.9, 0.03], [0.0, 0.02, 2.1]])
@@ -97,3 +100,35 @@ def test_another_sensitivity_a_knock_and_a_stuck_output_are_no_other_lag() -> No
     assert longest_in_time(knocked, expected, time_s, 0.15, 50.0) is None
     stuck = np.where(middle[:, None], V[1450], V)
     assert longest_in_time(stuck, expected, time_s, 0.15, 50.0) is None
+
+
+def stretches(number: int, rate: float, lag_s: float, kept: list[weakref.ref[np.ndarray]]) -> Iterator[tuple]:
+    """Stretches of SECONDS whose outputs come late by `lag_s` in the middle of all, and by `rate` more each second."""
+    middle_s = 0.5 * number * SECONDS
+    for k in range(number):
+        time_s = k * SECONDS + np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
+        u = motion(time_s, 3 * k, (0.5, 12.0))
+        V = motion(time_s - lag_s - rate * (time_s - middle_s), 3 * k, (0.5, 12.0)) @ S.T
+        kept.append(weakref.ref(V))
+        yield time_s, V, u
+        del V, u
+
+
+@pytest.mark.parametrize(("rate", "lag_s"), [(0.0, -0.09), (1.5e-4, 0.05), (-5e-5, 0.0)])
+def test_clocks_that_run_apart_are_found_by_correlation_without_holding_all_samples(rate: float, lag_s: float) -> None:
+    kept: list[weakref.ref[np.ndarray]] = []
+    number, omega = 30, 2.0 * np.pi * 7.0
+    alive = []
+
+    def watched() -> Iterator[tuple]:
+        for one in stretches(number, rate, lag_s, kept):
+            alive.append(sum(ref() is not None for ref in kept))
+            yield one
+
+    told = correlated_lag(watched(), number * SECONDS, 0.12, 2e-4, omega)
+    assert told is not None
+    found_s, change, at_s = told
+    ends_s = np.array([0.0, number * SECONDS])
+    errors_s = found_s + change * (ends_s - at_s) - lag_s - rate * (ends_s - ends_s.mean())
+    assert np.abs(errors_s).max() < 0.25 * np.pi / omega + 1.0 / RATE_HZ  # an eighth of a period, and a sample
+    assert max(alive) <= 2
