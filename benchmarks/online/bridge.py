@@ -332,12 +332,14 @@ def one(job: Job) -> Month:
         if visit == round(CUT[1] * HOURS_A_DAY):
             house.restart(own.config)
         house.visit()
-        update = gateway.in_force
-        assert update is not None  # the first window is taken
-        truth = own.truth(own.bridge.span(visit)[1], update.reference_frequency_hz)
+        said, update = gateway.reasons[before:], gateway.in_force
+        truth = own.truth(own.bridge.span(visit)[1], 0.0 if update is None else update.reference_frequency_hz)
+        if update is None:  # nothing is in force before the first window is taken
+            hours.append(Hour(gateway.status, said, truth, np.full(12, np.inf), np.zeros(12, dtype=bool), truth))
+            continue
         value, determined = np.append(np.ravel(update.sensitivity), update.offset), np.array(update.determined)
         u = np.array(update.standard_uncertainty)
-        hours.append(Hour(gateway.status, gateway.reasons[before:], value, u, determined, truth))
+        hours.append(Hour(gateway.status, said, value, u, determined, truth))
     return month(job, hours)
 
 

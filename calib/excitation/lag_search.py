@@ -142,25 +142,25 @@ def correlated_lag(
     at both ends of the parts; `without_lag` leads from there to the lag.
     """
     every, reach_s = max(1, int(np.ceil(span_s / (PIECE_S * MOST_PIECES)))), furthest_s + 0.5 * most_rate * span_s
-    period_s, middles, correlations = 0.0, [], []
+    step_s, middles, correlations = 0.0, [], []
     for time_s, V, u in islice((piece for part in parts for piece in _pieces(*part)), 0, None, every):
-        period_s = period_s or float(median(np.diff(time_s)))
+        step_s = step_s or float(median(np.diff(time_s))) / FINER
         middles.append(0.5 * (time_s[0] + time_s[-1]))
-        correlations.append(_correlation(V, u, int(np.ceil(reach_s / period_s)) + 1))
+        correlations.append(_correlation(V, u, int(np.ceil(reach_s / step_s)) + 1))
     if not middles:
         return None
     middles_s = np.array(middles)
     at_s, half_s = 0.5 * float(middles_s[0] + middles_s[-1]), 0.5 * float(np.ptp(middles_s))
-    finest = max(2.0 * period_s, np.pi / 4.0 / omega) / half_s if half_s else np.inf
+    finest = max(2.0 * FINER * step_s, np.pi / 4.0 / omega) / half_s if half_s else np.inf
     number = int(min(np.ceil(most_rate / finest), MOST_RATES))
     rates = np.linspace(-most_rate, most_rate, 2 * number + 1) if number else np.zeros(1)
-    shifts = np.rint(np.outer(rates, middles_s - at_s) / period_s).astype(int)
-    size = int(np.ceil(furthest_s / period_s))
+    shifts = np.rint(np.outer(rates, middles_s - at_s) / step_s).astype(int)
+    size = int(np.ceil(furthest_s / step_s))
     total = np.zeros((len(rates), 2 * size + 1))
     for correlation, own in zip(correlations, shifts.T, strict=True):
         for row, first in zip(total, (own + len(correlation) // 2 - size).tolist(), strict=True):
             row += correlation[first : first + 2 * size + 1]
-    return _slowest_peak(total, rates, period_s, at_s)
+    return _slowest_peak(total, rates, step_s, at_s)
 
 
 def _pieces(time_s: Array, V: Array, u: Array) -> Iterable[tuple[Array, Array, Array]]:
@@ -170,16 +170,17 @@ def _pieces(time_s: Array, V: Array, u: Array) -> Iterable[tuple[Array, Array, A
 
 
 def _correlation(V: Array, u: Array, size: int) -> Array:
-    """The squared correlation (2 size + 1,) of outputs and reference, at lags of -size to size samples."""
-    length = 1 << (len(V) + size).bit_length()
+    """The squared correlation (2 size + 1,) of outputs and reference, at lags of -size to size steps of a sample over
+    FINER: between two samples the peak of fast motion would be too low."""
+    length = 1 << (len(V) + size // FINER).bit_length()
     out, moved = (np.fft.rfft(x - x.mean(axis=0), length, axis=0) for x in (V, u))
     power = np.outer(*(np.var(x, axis=0) * len(x) for x in (V, u)))
-    both = np.fft.irfft(out[:, :, None] * moved[:, None, :].conj(), length, axis=0)
-    both = np.concatenate([both[length - size :], both[: size + 1]])
+    both = FINER * np.fft.irfft(out[:, :, None] * moved[:, None, :].conj(), FINER * length, axis=0)
+    both = np.concatenate([both[-size:], both[: size + 1]])
     return np.asarray(np.divide(both**2, power, out=np.zeros_like(both), where=power > 0.0).sum(axis=(1, 2)) * len(V))
 
 
-def _slowest_peak(total: Array, rates: Array, period_s: float, at_s: float) -> tuple[float, float, float] | None:
+def _slowest_peak(total: Array, rates: Array, step_s: float, at_s: float) -> tuple[float, float, float] | None:
     """The peak of correlations (R, 2 size + 1), at these rates and at lags around 0, that counts."""
     if not total.max() > 0.0:
         return None
@@ -191,4 +192,4 @@ def _slowest_peak(total: Array, rates: Array, period_s: float, at_s: float) -> t
     peaks = np.argwhere((total >= AS_HIGH * total.max()) & (total >= along) & (total >= across))
     lags = peaks[:, 1] - total.shape[1] // 2
     first = np.lexsort([np.abs(lags), np.abs(rates[peaks[:, 0]])])[0]
-    return float(lags[first] * period_s), float(rates[peaks[first, 0]]), at_s
+    return float(lags[first] * step_s), float(rates[peaks[first, 0]]), at_s

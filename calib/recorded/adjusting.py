@@ -29,6 +29,7 @@ from calib.recorded.table import SensorTable
 from calib.recorded.tables import Tables
 from calib.rounding import from_to
 from calib.signal.known_response import known_of
+from calib.signal.order_statistics import median
 from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.stamps import clock_from_stamps
 from calib.windows.bands import lowest_hz, motion_band_hz
@@ -45,6 +46,8 @@ RESPONSE_TURNS = 6
 BETTER = 1.25  # times: largest u of the main sensitivities from rests alone over that from all windows
 # Prior standard uncertainties from which on an attenuation at one frequency is not that of a filter with this lag.
 UNLIKELY = 3.0
+EIGHTH_RAD = np.pi / 4.0  # of the motion's phase: a correlation finds the lag at least so well
+FOLLOWS = 0.9  # of the power of the output: the share that the reference explains where the lag is right, but for noise
 HOPELESS = 2  # turns after which a refusal no longer comes from the response that is not yet taken out
 
 
@@ -211,12 +214,16 @@ class _Search:
         """Make the first windows; returns what the search goes on with.
 
         If none can be used the sensor may be far too late, or a response may look like a mean that changes. If the lags
-        that they show are still large, the two clocks run apart.
+        that they show are still large, the two clocks run apart. The lag that they lead to may also be another one.
         """
         flat = Applied(self._priors.lag_at_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
         applied = self.make(flat)
-        if not _used(self.windows) or self._tables.far:
-            applied = self.make(replace(flat, lag_s=_likely_lag_s(self._tables, self._priors, self.windows)))
+        lost = not _used(self.windows) or self._tables.far
+        if lost or self._may_be_another_lag(applied):
+            rate, lag_s = self._tables.rate, _likely_lag_s(self._tables, self._priors, self.windows)
+            elsewhere = abs(lag_s - applied.lag_s) * largest_omega(self.windows) > EIGHTH_RAD
+            if lost or elsewhere or self._tables.rate != rate:
+                applied = self.make(replace(flat, lag_s=lag_s))
         if _used(self.windows):
             return applied
         refused = self.windows
@@ -224,6 +231,12 @@ class _Search:
         response = self.at(self.windows, taken).response if _used(self.windows) else None
         self.windows = refused
         return applied if response is None else replace(taken, response=_next_response(response.terms))
+
+    def _may_be_another_lag(self, taken: Applied) -> bool:
+        """Whether the outputs may follow the reference better at another lag: half a period away from the right one, a
+        sensor seems to be inverted."""
+        inverted = float(self.at(self.windows, taken).mean[MAIN].sum()) < 0.0
+        return inverted or _coherence(self.windows) < FOLLOWS
 
     def at(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
         """The adjustment of windows from which this was taken out; the latest one is kept."""
@@ -275,6 +288,12 @@ def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:
         f"only {used} of {points} points in motion can be used, at least {LEAST_USED:.0%} are needed; the first window "
         f"that cannot be used ({refused.pose.position}): {refused.reason}",
     )
+
+
+def _coherence(windows: Sequence[Window]) -> float:
+    """The share of the sensor's power that the reference explains, of half of the windows in motion."""
+    shares = [w.numbers["coherence"] for w in _used(windows) if w.kind == "motion" and "coherence" in w.numbers]
+    return float(median(np.array(shares))) if shares else 1.0
 
 
 def _likely_lag_s(tables: Tables, priors: Priors, windows: Sequence[Window]) -> float:

@@ -181,8 +181,9 @@ class _WindowBands:
     """What the three axes of a window say of the terms, whatever their rows of B and their lags are.
 
     `residual` (R,) and `moves` (R, K) are whitened, and orthogonal to all that B and the lag can do. `signal` (R,) is
-    the row without that projection, `at_hz` (R,) its frequency, `noise` (R,) what it was divided by, `free` the number
-    of unknowns that were projected out.
+    what they can do of the row, `at_hz` (R,) its frequency, `noise` (R,) what it was divided by, `free` the number of
+    unknowns that were projected out. The noise of `residual` and that of `signal` are not correlated. `moved`: the sum
+    of the products of residual, signal and noise^2 has this variance.
     """
 
     residual: Array
@@ -191,6 +192,7 @@ class _WindowBands:
     at_hz: Array
     noise: Array
     free: int
+    moved: float
 
 
 def _told(factors: Factors, powers: int) -> _WindowBands:
@@ -209,7 +211,10 @@ def _told(factors: Factors, powers: int) -> _WindowBands:
     rows = np.concatenate([observed[..., None], *(factors.seen(terms.T) @ gain)], axis=2)
     rows = (rows - ways @ (ways.transpose(0, 2, 1) @ rows)).reshape(-1, 1 + powers)
     at_hz, noise = np.tile(factors.by_row(factors.middle_hz), 3), factors.by_row(factors.noise.T).ravel()
-    return _WindowBands(rows[:, 0], rows[:, 1:], observed.ravel(), at_hz, noise, 3 * free.shape[2])
+    signal = np.where(observed.ravel() != 0.0, observed.ravel() - rows[:, 0], 0.0)
+    weighted = (signal * noise**2).reshape(3, -1, 1)
+    moved = float(np.sum((weighted - ways @ (ways.transpose(0, 2, 1) @ weighted)) ** 2))
+    return _WindowBands(rows[:, 0], rows[:, 1:], signal, at_hz, noise, 3 * free.shape[2], moved)
 
 
 def _left_open(factors: Factors, powers: int) -> LeftOpen:
@@ -245,7 +250,7 @@ class _PooledBands:
     def __init__(self, powers: int) -> None:
         self._powers, self._rows, self._free = powers, 0, 0
         self._triangle = np.zeros((0, powers + 1))  # R of the rows [moves, residual]
-        self._sums = np.zeros(4)  # of size, size variance, size variance^2, and of the rows with a signal
+        self._sums = np.zeros(4)  # of size, size variance, the variance of what is moved, and of the rows with a signal
         # For each third of an octave: sums of signal variance [moves, residual], and of size variance.
         self._thirds: dict[int, Array] = {}
 
@@ -254,7 +259,7 @@ class _PooledBands:
         rows = np.column_stack([told.moves, told.residual])
         self._triangle = np.asarray(np.linalg.qr(np.vstack([self._triangle, rows]), mode="r"), dtype=np.float64)
         size, variance = told.signal**2, told.noise**2
-        parts = (size.sum(), size @ variance, size @ variance**2, np.count_nonzero(size))
+        parts = (size.sum(), size @ variance, told.moved, np.count_nonzero(size))
         self._sums += np.array(parts, dtype=np.float64)
         self._rows, self._free = self._rows + len(rows), self._free + told.free
         moved = np.column_stack([(told.signal * variance)[:, None] * rows, size * variance])

@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 
 from calib.model import Array, BandSums, Window, own_channels
 from calib.signal.band import hanning
@@ -32,6 +33,9 @@ OVER_NOISE = 100.0
 LEAST_SHARE, FEWEST_THIRDS = 1e-2, 4
 LEAST_SHOWN = 0.25  # of V in a band, by the motion: with less, the reference's noise may look like motion
 HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is rounded
+LEAKED = 1.0  # of the power of a band, that may be of motion at other frequencies: with more, it shows their response
+NEAR_LINES = 3  # around a line that it has itself: the main lobe of a taper
+LEAST_LEAK = 1e-12  # of a line's power, in another one: what is less is beyond the numbers
 LASTS = 0.25  # of its mean power that a band has for half of the time: with less, its motion comes and goes
 BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
 
@@ -40,8 +44,10 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
     """Band sums of evenly sampled u (n, m) in m/s2, du (n, m) in m/s3 and V (n, 3) in output unit.
 
     `share` of the window is tapered at each end. With HANN motion that is much stronger at other frequencies does not
-    leak into a band; the sums then have the weight of half of the points. u may hold the integrals of a reference as
-    well (calib.signal.corner). None where the window is too short for a few bands, and without a reference.
+    leak into a band; the sums then have the weight of half of the points. Bands in which more than LEAKED of the power
+    leaks from elsewhere are left out: of two tones, those between them show the response at the tones. u may hold the
+    integrals of a reference as well (calib.signal.corner). None where the window is too short for a few bands, and
+    without a reference.
     """
     n, m = u.shape
     fewest = 2 * own_channels(m) + MORE_LINES
@@ -59,7 +65,32 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
     ends_hz = np.append(frequency_hz, 0.5 * rate_hz)[edges]
     nothing, moved = np.zeros((len(products), 2 * m + 3)), own_channels(m)
     lasting = np.array([_lasting(part[:moved]) for part in own])
-    return BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing, lasting)
+    made = BandSums(m, ends_hz[:-1], ends_hz[1:], 2.0 * np.diff(edges), density, 2.0 / n * products, nothing, lasting)
+    power = np.sum(np.abs(lines[:moved]) ** 2, axis=0)
+    leaks = np.add.reduceat(_leaking(power, n, share), edges[:-1])
+    return parts(made, leaks <= LEAKED * np.add.reduceat(power, edges[:-1]))
+
+
+def _leaking(power: Array, n: int, share: float) -> Array:
+    """(L,) what of the power (L,) of the lines of n points leaks from other lines at most, for `_taper(n, share)`."""
+    size = next_fast_len(2 * len(power), real=True)
+    return np.asarray(np.fft.irfft(np.fft.rfft(power, size) * _leak(len(power), n, share), size)[: len(power)])
+
+
+@lru_cache(maxsize=4)
+def _leak(lines: int, n: int, share: float) -> Complex:
+    """The spectrum of the share of a line's power that leaks into a line so many further, which is at most that of the
+    highest side lobe from there on: a tone may lie between two lines."""
+    taper, _ = _taper(n, share)
+    lobes = np.abs(np.fft.rfft(taper, 2 * n)) ** 2
+    envelope = np.maximum.accumulate(lobes[::-1])[::-1][: 2 * lines : 2] / lobes[0]
+    envelope[:NEAR_LINES] = 0.0
+    around = np.zeros(next_fast_len(2 * lines, real=True))
+    around[: len(envelope)] = np.where(envelope > LEAST_LEAK, envelope, 0.0)
+    around[1:] += around[:0:-1].copy()
+    spectrum = np.fft.rfft(around)
+    spectrum.flags.writeable = False
+    return np.asarray(spectrum)
 
 
 def _lasting(lines: Complex) -> float:

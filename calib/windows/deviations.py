@@ -91,7 +91,7 @@ class Deviations:
         if self.freedom < 1.0:
             return BetweenBands()
         excess = self.square - NOISIER * self.freedom if self.times_noise > 1.0 else 0.0
-        shifted = self.moved**2 > chi2_quantile(PROBABILITY, 1.0) * self.variance
+        shifted = self.moved**2 > NOISIER * chi2_quantile(PROBABILITY, 1.0) * self.variance
         shift = abs(self.moved) / self.power if shifted else 0.0
         return BetweenBands(float(np.sqrt(max(excess, 0.0) / self.signal)), shift, self.at_hz, self.largest)
 

@@ -73,6 +73,8 @@ REVISIONS = (
     Revision(16, "bda75986f69f", "0.3.0"),
     # The last before U contains what channels without a signal of their own add to transverse slopes.
     Revision(17, "1cf1dd153582", "0.3.0"),
+    # The last before bands into which motion leaks are left out, and before the noise of bands is no deviation.
+    Revision(18, "0746c1187b6e", "0.3.0"),
 )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from calib import calibrate
 from calib.excitation.lag_search import correlated_lag, longest_in_time, minima, misfit_by_lag
 
 RATE_HZ, SECONDS, NOISE = 100.0, 40.0, 0.05
@@ -132,3 +133,35 @@ def test_clocks_that_run_apart_are_found_by_correlation_without_holding_all_samp
     errors_s = found_s + change * (ends_s - at_s) - lag_s - rate * (ends_s - ends_s.mean())
     assert np.abs(errors_s).max() < 0.25 * np.pi / omega + 1.0 / RATE_HZ  # an eighth of a period, and a sample
     assert max(alive) <= 2
+
+
+@pytest.mark.parametrize(
+    ("upper", "lag_s", "noise_mps2", "bursts"), [(1.6, 0.017, 0.01, True), (3.0, 0.0125, 0.035, False)]
+)
+def test_of_two_tones_the_lag_is_not_that_of_an_inverted_sensor(
+    upper: float, lag_s: float, noise_mps2: float, bursts: bool
+) -> None:
+    """Tones of 16.2 Hz and 1.6 or 3 times that, on each axis in turn. From a lag of 0 windows lead to half a period of
+    both: there a sensor seems to be inverted, and with odd multiples it fits as well."""
+    random = np.random.default_rng(6)
+    time_s = np.arange(6 * 3000) / 200.0
+    S = np.eye(3) + 0.02 * random.standard_normal((3, 3))
+    phase = random.uniform(0.0, 2.0 * np.pi, (2, 6))
+
+    def moved(at_s: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        stay = np.clip(at_s // 15.0, 0, 5).astype(int)
+        level = 0.1 + np.clip(np.sin(2.0 * np.pi * at_s / 7.0), 0.0, 1.0) if bursts else np.ones_like(at_s)
+        tones = [
+            share * np.sin(2.0 * np.pi * 16.2 * times * at_s + own[stay])
+            for share, times, own in zip((1.0, 0.8), (1.0, upper), phase, strict=True)
+        ]
+        return np.asarray((level * sum(tones))[:, None] * np.eye(3)[stay % 3])
+
+    V = moved(time_s - lag_s) @ S.T + noise_mps2 * random.standard_normal((len(time_s), 3))
+    u = moved(time_s) + 0.1 * noise_mps2 * random.standard_normal(V.shape)
+    reference = {"time_s": time_s, "ax": u[:, 0], "ay": u[:, 1], "az": u[:, 2]}
+    known = {"sensor_filter": ["flat"], "reference_filter": ["flat"]}
+    found = calibrate((time_s, V), reference, rotation=np.eye(3), **known)
+    assert found.status == "valid", found.reasons
+    assert found.lag_s == pytest.approx(lag_s, abs=2e-4)
+    assert np.abs((found.sensitivity - S) / found.standard_uncertainty[:9].reshape(3, 3)).max() < 4.0
