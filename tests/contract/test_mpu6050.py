@@ -112,7 +112,7 @@ class TestMpu6500(TestMpu6050):
         assert info.settings["ACCEL_CONFIG_2"] == "0x01"
         assert bytes(rig.twin.registers[0x77:0x7D]) == TRIM
 
-    def test_no_sample_is_lost_doubled_or_shifted(self, rig: Mpu6050Rig) -> None:
+    def test_no_sample_is_lost_doubled_or_shifted(self, rig: Mpu6050Rig) -> None:  # type: ignore[override]
         """Done for one part only, because the parts differ only in identity, FIFO size and temperature."""
         rig.open()
         assert sum(block.n for block in rig.blocks(5.0)) >= 5000

@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def test_files_hold_the_recording_and_its_truth(preset, tmp_path, capsys) -> Non
     files = " ".join(f"--{name} {directory}/{name}.csv" for name in ("sensor", "reference", "poses"))
     assert capsys.readouterr().out == f"fieldcal calibrate {files} --nominal 26104.7 --u-nominal-pct 20\n"
     recording = Bench(PRESETS[preset](3), 3).recording(30.0)
-    half_microsecond = {"rtol": 0, "atol": 0.5001e-6}
+    half_microsecond: dict[str, Any] = {"rtol": 0, "atol": 0.5001e-6}
     sensor = np.loadtxt(directory / "sensor.csv", delimiter=",", skiprows=1)
     assert (directory / "sensor.csv").read_text().startswith("time_s,vx,vy,vz,temperature_degc\n")
     assert_allclose(sensor[:, 0], recording.sensor_stamp_s, **half_microsecond)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def in_order(*devices: list[SampleBlock]) -> list[Event]:
     return [opened("s", 0.0), opened("r", 0.0, axes=1), *sent]
 
 
-def clocks(found: Pipeline, events: list[Event]) -> list[ClockReport]:
+def clocks(found: Pipeline, events: Iterable[Event]) -> list[ClockReport]:
     return [r for event in events for r in found.step(event) if isinstance(r, ClockReport)]
 
 
@@ -97,7 +98,7 @@ def test_the_lag_is_that_of_the_sensor_behind_the_reference(lag_s: float) -> Non
 
 def test_a_lag_that_no_window_told_is_unknown() -> None:
     late_s = np.zeros(6500)
-    alone = [opened("s", 0.0), *blocks("s", 101.3, 100.0, 62.0, late_s)]
+    alone: list[Event] = [opened("s", 0.0), *blocks("s", 101.3, 100.0, 62.0, late_s)]
     silent = in_order(blocks("s", 101.3, 100.0, 62.0, late_s), [])
     for found, events in ((pipeline(reference=False, rate_hz=100.0), alone), (pipeline(True, 100.0), silent)):
         [report] = clocks(found, list(events))
@@ -124,7 +125,7 @@ def test_minutes_in_which_nothing_happens_are_not_made_up_for() -> None:
 def test_a_device_in_place_of_another_is_not_reported_by_the_clock_before() -> None:
     found = pipeline(reference=True, rate_hz=100.0)
     clocks(found, both(59.0))
-    swapped = [lost("r", 59.5), opened("r", 59.6, axes=1, serial_number="other"), tick(61.0)]
+    swapped: list[Event] = [lost("r", 59.5), opened("r", 59.6, axes=1, serial_number="other"), tick(61.0)]
     assert [r.device for r in clocks(found, list(swapped))] == ["s"]
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from agent.config import ConfigError, load_config, parse_config
-from agent.config.reading import LARGEST_FILE, SHOWN_FAULTS
+from agent.config.faults import SHOWN_FAULTS
+from agent.config.reading import LARGEST_FILE
 from agent.config.size import LONGEST_LIST
 
 DEVICES = """
@@ -123,6 +124,7 @@ def test_a_file_that_is_none_is_a_fault(tmp_path: Path, content: bytes | None) -
     assert all(line.startswith(f"{path}: ") for line in caught.value.faults)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "said"),
     [

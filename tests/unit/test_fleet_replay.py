@@ -108,7 +108,15 @@ def test_dask_gives_the_same_bits(recordings: Path, tmp_path: Path) -> None:
     )
     assert distributed.__version__
     (tmp_path / "cluster.py").write_text(script)
-    told = [sys.executable, tmp_path / "cluster.py", "fleet", "replay", recordings, "-o", tmp_path / "dask"]
+    told: list[str | Path] = [
+        sys.executable,
+        tmp_path / "cluster.py",
+        "fleet",
+        "replay",
+        recordings,
+        "-o",
+        tmp_path / "dask",
+    ]
     done = subprocess.run(
         told, capture_output=True, text=True, timeout=120, env=os.environ | {"PYTHONPATH": os.getcwd()}
     )

@@ -93,7 +93,7 @@ def test_dates_with_a_zone_are_times() -> None:
         for time in (stamps, stamps.tz_localize("UTC").tz_convert("Europe/Rome"))
     )
     np.testing.assert_array_equal(zoned, naive)
-    np.testing.assert_allclose(naive - 1e9, SENSOR["time_s"], atol=3e-7)
+    np.testing.assert_allclose(np.asarray(naive) - 1e9, SENSOR["time_s"], atol=3e-7)
 
 
 @pytest.mark.parametrize("kind", TEXTS)

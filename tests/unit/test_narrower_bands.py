@@ -106,7 +106,7 @@ def test_a_notch_just_above_the_narrower_band_does_not_bend_s() -> None:
     """Limited to 5.4 Hz the bands deviate by less than 0.1 % from one response, and S is 0.2 % off (7 u): 3.8 Hz shows
     it."""
     made = pair(3, notched)
-    exact = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
+    exact: dict[str, Any] = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
     at_hz = Priors(reference_frequency_hz=made.reference_frequency_hz, **exact)
     bent = adjusted(made.files, at_hz, band_hz=(0.0, 5.402))
     assert np.abs(np.diag(bent.sensitivity - made.sensitivity)).max() > 1e-3

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
@@ -28,7 +26,7 @@ from tests.unit.results import calibration
 
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
-STILL = replace(Wander.none(), offset_rate_mps2=1e-9)
+STILL = Wander({**Wander.none().values, "offset_rate_mps2": 1e-9})
 PRIORS = Priors(gravity_mps2=0.03, offset_mps2=1e-3, lag_window_s=0.0, reference=1e-3, reference_per_k=2e-4)
 BY_DEFAULT = TemperatureModel(1, 1, settles=True)
 OF_S = np.array([[1e-4, 2e-4, 0.0], [-3e-4, -1e-4, 0.0], [0.0, 1e-4, 2e-4]])

@@ -169,7 +169,9 @@ def test_an_event_whose_results_were_torn_off_changes_nothing(tmp_path: Path) ->
     recorder.record(last, steps[last].event, [])
     recorder.sync()
     ((_, torn),) = recordings(tmp_path / "torn")
-    (memory,) = RECALL(torn, None) or ()
+    memories = RECALL(torn, None)
+    assert memories is not None
+    (memory,) = memories
     recorder.close()
     assert (memory.sequence, unpack(memory.state)["in_force"]) == (before[-1], None)
 
