@@ -147,7 +147,7 @@ def test_a_mount_that_leans_is_named_with_its_angle() -> None:
     assert f"A mount that leans by {truth['lean_deg']:.0f} deg does the same" in reasons
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_page_reads_what_the_agent_says_of_held_windows() -> None:
     (line,) = (line for line in WORDS.read_text().splitlines() if line.startswith("const EXPLAINED = /"))
     pattern = (
