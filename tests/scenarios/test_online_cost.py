@@ -6,6 +6,8 @@ import itertools
 import sys
 from typing import Any
 
+import pytest
+
 from agent.core.events import WindowReport
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
