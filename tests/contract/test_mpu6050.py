@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from hw.block import BlockFlags
@@ -69,16 +70,19 @@ class TestMpu6050(I2cContract):
                 value = super()._get(register)
                 if register == 0x73 and value > 30 and not self.caught:
                     self.caught = 1
-                    return value - 3
+                    return value - 4
                 return value
 
         twin = Writing(rig.counts, rig.due, lambda: rig.t_s)
         rig.put(twin)
         rig.sensor.open()
+        numbers = []
         for expected in (BlockFlags.RESTART, BlockFlags.NONE):
-            flags, _ = rig.read()
+            flags, number = rig.read()
             assert flags == expected
+            numbers.append(number)
         assert twin.caught
+        assert set(np.diff(np.concatenate(numbers)).tolist()) == {1}
         assert rig.sensor.take_drops() == []
 
     def test_an_unknown_part_is_taken_only_when_asked(self, rig: Mpu6050Rig) -> None:

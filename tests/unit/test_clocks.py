@@ -17,7 +17,7 @@ from agent.core.snapshot import pack, unpack
 from agent.core.stream import DeviceStream
 from agent.delivery.history import StoredResult
 from calib.distributions import chi2_quantile
-from hw.block import SampleBlock
+from hw.block import BlockFlags, SampleBlock
 from tests.unit.test_pipeline import EPOCH_NS, SECOND, felt, lost, motion, opened, pipeline, tick
 
 BLOCK_S = 0.5
@@ -168,3 +168,14 @@ def test_numbers_that_are_unknown_are_null_in_json() -> None:
     [report] = clocks(pipeline(reference=True, rate_hz=100.0), events)
     fields = json.loads(StoredResult.of(report, recorded=True, recording="f").payload)
     assert (fields["lag_s"], fields["u_lag_s"], fields["device"], fields["role"]) == (None, None, "s", "sensor")
+
+
+def test_a_break_is_from_the_end_of_the_last_sample_to_the_first_one_after_it() -> None:
+    stream, rate_hz, n = DeviceStream("s", 0), 100.0, 50
+    for begins_s, flags in ((1.0, BlockFlags.RESTART), (1.5, BlockFlags.NONE), (4.0, BlockFlags.RESTART)):
+        first = round(begins_s * rate_hz)
+        count = np.arange(10, n + 1, 10, dtype=np.int32)
+        arrivals = np.round((first + count) / rate_hz * SECOND).astype(np.int64)
+        stream.update(SampleBlock("s", "boot", 0, first, rate_hz, arrivals, count, np.zeros((n, 3)), flags=flags))
+    [(ended_s, began_s)] = stream.breaks(0.0, 10.0)
+    assert (ended_s, began_s) == pytest.approx((2.0, 4.0), abs=0.02)

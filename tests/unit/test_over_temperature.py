@@ -15,7 +15,7 @@ from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
 from calib.estimate.statements import Statements
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.model import Pose
+from calib.model import PARAMETERS, Pose
 from calib.state.state import State
 from calib.state.thinning import merged
 from calib.windows.record import Record
@@ -157,3 +157,8 @@ def test_exported_samples_are_corrected_at_their_temperature() -> None:
     found = acceleration(V, update, 25.0)
     assert found is not None
     np.testing.assert_allclose(found, a, rtol=1e-12)
+
+
+def test_each_element_of_s_and_q_may_follow_the_temperature_late() -> None:
+    names = [quantity.name for quantity, _ in TemperatureModel(1, 1, 10.0, settles=True).behind(1.0)]
+    assert names == [f"{name}_behind" for name in PARAMETERS]
