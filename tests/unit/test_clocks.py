@@ -179,3 +179,5 @@ def test_a_break_is_from_the_end_of_the_last_sample_to_the_first_one_after_it() 
         stream.update(SampleBlock("s", "boot", 0, first, rate_hz, arrivals, count, np.zeros((n, 3)), flags=flags))
     [(ended_s, began_s)] = stream.breaks(0.0, 10.0)
     assert (ended_s, began_s) == pytest.approx((2.0, 4.0), abs=0.02)
+    stream.forget_before(3.0)
+    assert stream.breaks(0.0, 10.0) == []

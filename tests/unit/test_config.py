@@ -10,7 +10,7 @@ import pytest
 
 from agent.config import ConfigError, load_config, parse_config
 from agent.config.faults import SHOWN_FAULTS
-from agent.config.reading import LARGEST_FILE
+from agent.config.reading import LARGEST_FILE, refused
 from agent.config.size import LONGEST_LIST
 
 DEVICES = """
@@ -155,6 +155,12 @@ def test_a_hostile_file_is_refused_soon_and_in_few_words(tmp_path: Path, text: s
     assert time.process_time() - began_s < 5.0
     assert len(caught.value.faults) <= SHOWN_FAULTS + 1
     assert max(len(fault) for fault in caught.value.faults) < len(str(path)) + 400
+
+
+def test_faults_that_are_not_shown_are_counted() -> None:
+    fault = ("a", "wrong")
+    assert refused([fault] * SHOWN_FAULTS, "f", "").faults == ["f: a: wrong"] * SHOWN_FAULTS
+    assert refused([fault] * (SHOWN_FAULTS + 1), "f", "").faults[SHOWN_FAULTS:] == ["f: and 1 more faults, not shown"]
 
 
 def test_files_of_tls_are_checked_with_the_rest(tmp_path: Path) -> None:
