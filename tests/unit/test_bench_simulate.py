@@ -213,6 +213,7 @@ def _waiting(port: int) -> int:
     return int.from_bytes(fcntl.ioctl(port, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
+@pytest.mark.slow
 def test_a_bench_serves_both_devices_from_one_zero_until_interrupted(tmp_path) -> None:
     with running("--preset", "plain", "--seed", "4", "--link", str(tmp_path / "bench")) as process:
         assert process.stdout is not None

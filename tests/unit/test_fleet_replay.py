@@ -237,6 +237,7 @@ def test_a_wrong_setting_is_refused_with_its_path_before_any_file_is_read(text: 
         ChangedSetting.of(text)
 
 
+@pytest.mark.slow
 def test_a_setting_that_a_recording_cannot_have_refuses_that_recording(recordings: Path) -> None:
     for setting, told in (
         ("channels.other.window_s=20", "channels.other: the recording has no such channel; there is mems"),

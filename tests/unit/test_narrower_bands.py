@@ -66,6 +66,7 @@ def test_a_resonance_that_hides_the_motion_in_all_windows() -> None:
     np.testing.assert_array_equal(again.values, found.values)  # what was tried before leaves no trace
 
 
+@pytest.mark.slow
 def test_a_resonance_contradicts_filters_that_are_stated_flat() -> None:
     """The reference's resonance of Q 33 at 2.8 Hz, in motion to 10 Hz: with filters stated flat S was valid and -19.8
     +- 1.0, and the refusal without them said to state so."""

@@ -103,6 +103,7 @@ def values(update: Result) -> tuple[object, ...]:
 
 
 # The last file: all of the run, its second half, and one without a window, which has all from its snapshot.
+@pytest.mark.slow
 @pytest.mark.parametrize("rotate_at", [(), (25,), (25, 39)])
 def test_a_lost_store_comes_back_with_what_the_estimation_knew(tmp_path: Path, rotate_at: Sequence[int]) -> None:
     results, memories = recorded(tmp_path, rotate_at)

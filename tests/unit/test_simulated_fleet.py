@@ -250,6 +250,7 @@ def test_a_fleet_in_several_processes_is_the_same_fleet(
         assert all(after[name] > before[name] for name in after)
 
 
+@pytest.mark.slow
 def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: Path) -> None:
     with (
         SimulatedFleet(5, 1, 1, [site.endpoint], tmp_path) as fleet,
