@@ -158,7 +158,7 @@ def test_a_hostile_file_is_refused_soon_and_in_few_words(tmp_path: Path, text: s
 
 
 def test_faults_that_are_not_shown_are_counted() -> None:
-    fault = ("a", "wrong")
+    fault = (("a",), "wrong")
     assert refused([fault] * SHOWN_FAULTS, "f", "").faults == ["f: a: wrong"] * SHOWN_FAULTS
     assert refused([fault] * (SHOWN_FAULTS + 1), "f", "").faults[SHOWN_FAULTS:] == ["f: and 1 more faults, not shown"]
 
