@@ -59,6 +59,13 @@ def test_a_blow_that_reaches_down_to_nothing_is_no_lower_end() -> None:
     assert common_band([replace(narrow, motion_hz=(20.0, 40.0)), narrow]) == (low_hz, high_hz, 2)
 
 
+def test_the_lower_end_is_that_of_most_windows_where_more_than_an_octave_is_left() -> None:
+    narrow = Record.of(window(1), 0.0)
+    for most_hz, begins_hz in ((4.0, 4.0), (6.0, 1.0)):
+        lows_hz = [1.0, *[most_hz] * 7]
+        assert common_band([replace(narrow, motion_hz=(low_hz, 10.0)) for low_hz in lows_hz]) == (begins_hz, 10.0, 8)
+
+
 def test_the_record_of_a_narrower_band_is_that_of_its_motion_alone() -> None:
     """The sensor's filter makes the faster motion smaller and later; below 12 Hz it is that of a pure delay."""
     wide = Record.of(window(3, "W"), 0.0)
