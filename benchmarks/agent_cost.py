@@ -130,7 +130,8 @@ def main() -> None:
         try:
             with twins(directory):
                 starts = sorted(first_block_s(config, directory / f"start{i}") for i in range(5))
-            shares, peaks = {"agent": [], "screen": [], "bare": []}, []
+            shares: dict[str, list[float]] = {"agent": [], "screen": [], "bare": []}
+            peaks: list[float] = []
             for turn in range(2):
                 data = str(directory / f"data{turn}")
                 running = ["-m", "agent", "run", str(config), "--data-dir"]

@@ -17,8 +17,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from calib.model import Array
@@ -77,7 +79,7 @@ class Bridge:
     def __post_init__(self) -> None:
         self.random = random = np.random.default_rng(self.seed)
         n, m = self.sensors, len(FREQUENCY_HZ)
-        self.gateway = np.arange(n) * self.gateways // n
+        self.gateway: NDArray[Any] = np.arange(n) * self.gateways // n
         self.clock_h = random.uniform(-1.0, 1.0, self.gateways) * (2.0 / 60.0)
         place = (np.arange(n) + random.uniform(0.2, 0.8, n)) / n * 0.94 + 0.03
         side = np.where(np.arange(n) % 2, 1.0, -1.0)
@@ -232,7 +234,9 @@ class Bridge:
         return self.world.scatter * np.sqrt(len(BANDS_HZ)) * np.asarray(out)
 
 
-def changed(hours: Hours, sensor: Array, factor: float, axes: tuple[int, ...] = (0, 1, 2), first: int = 0) -> Hours:
+def changed(
+    hours: Hours, sensor: NDArray[Any], factor: float, axes: tuple[int, ...] = (0, 1, 2), first: int = 0
+) -> Hours:
     """The same hours with another sensitivity of these axes of some sensors, from hour `first` of the day on."""
     power, cross, noise = hours.power.copy(), hours.cross.copy(), hours.noise_psd.copy()
     scale = np.ones(3)

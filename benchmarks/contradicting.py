@@ -7,6 +7,9 @@ way for each row; the search for another lag is a part of its cost.
 from __future__ import annotations
 
 import os
+from typing import Any
+
+from numpy.typing import NDArray
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # as in every entry point of the product; must be set before numpy is loaded
 
@@ -32,7 +35,8 @@ WINDOW_S, APART_S, LEAD_S = 60.0, 180.0, 3.0
 SEED = 1
 SIZES = ((100.0, 12.0), (1000.0, 40.0))  # sampling rate and upper end of the motion in Hz
 
-Change = Callable[[SampleBlock, Array], SampleBlock]  # of a block of the sensor, by its arrivals in s since the window
+# Of a block of the sensor, by its arrivals in s since the window.
+Change = Callable[[SampleBlock, NDArray[Any]], SampleBlock]
 
 
 def shifted(by_s: float, since_s: float = -np.inf, until_s: float = np.inf) -> Change:
@@ -99,6 +103,7 @@ def measured(rate_hz: float, to_hz: float, change: Change | None) -> Cost:
         wrong = change is not None and visit >= FIRST and (visit - FIRST) % EVERY == 0
         if wrong and isinstance(event, SampleBlock) and event.device == "sensor":
             arrival_s = event.burst_t_monotonic_ns * 1e-9 - visit * APART_S - LEAD_S
+            assert change is not None
             event = change(event, arrival_s)
         begin = time.process_time()
         results = run.feed(event)

@@ -44,7 +44,7 @@ def recorded(directory: Path, number: int, seconds: float) -> list[Path]:
     for seed in range(1, number + 1):
         made = directory / f"made-{seed}"
         record(made, seconds, seed=seed, run_id=f"run-{seed}")
-        found.append(shutil.move(made / "fieldcal-000001.mcap", directory / f"gateway-{seed:04}.mcap"))
+        found.append((made / "fieldcal-000001.mcap").rename(directory / f"gateway-{seed:04}.mcap"))
         shutil.rmtree(made)
     return found
 

@@ -103,16 +103,17 @@ def _begun(bench: Bench, clock: BenchTime) -> Any:
 def run_agent(directory: Path, seconds: float) -> int:
     """Run `fieldcal run` with the kernel replaced; write the largest queue length into a file."""
     from agent.acquisition import service
+    from agent.acquisition.reader import EventQueue
     from agent.cli.main import run_cli
 
-    class Watched(service.EventQueue):
+    class Watched(EventQueue):
         longest = 0
 
         def put(self, device: str, event: Event) -> None:
             super().put(device, event)
             Watched.longest = max(Watched.longest, self._queue.qsize())
 
-    service.EventQueue = Watched  # type: ignore[misc]
+    service.EventQueue = Watched  # type: ignore[attr-defined, misc]
     buses = {f"/dev/i2c-{i}": RemoteBus(directory / f"i2c-{i}") for i in SENSORS}
     with installed(buses):
         data = str(directory / "data")

@@ -205,6 +205,8 @@ def figures(users: int) -> list[str]:
         f"{five[1]} beside the triad."
     )
     said, needed = _session(triad, priors(TRIAD_OFFSET_MPS2), main).outlook(), [e.all_stops for e in at_triad]
+    assert said.stops is not None
+    assert said.mostly is not None
     enough = [sum(0 < stops <= most for stops in needed) for most in (said.stops, said.mostly)]
     lines.append(
         f"\nBeside the triad the guide says beforehand: about {said.stops} stops; {said.mostly} are enough in 19 of 20 "

@@ -7,13 +7,14 @@ import json
 import subprocess
 import sys
 import wave
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from agent.core.events import Result
 from agent.delivery.history import StoredResult
 from agent.delivery.store import Store
 from agent.export.cdr import DEFINITIONS, IMU, imu
@@ -136,9 +137,8 @@ def _recordings(signed: Sequence[Path], recorded: Path) -> list[Kind]:
 def _fill(data_dir: Path) -> None:
     """Put calibrations, windows and a status into the store of a data directory."""
     store = Store(data_dir, 0)
-    results = [
-        made(number) for number, made in enumerate((window, status, calibration) * 3, start=store.last_sequence() + 1)
-    ]
+    makers: tuple[Callable[[int], Result], ...] = (window, status, calibration)
+    results = [made(number) for number, made in enumerate(makers * 3, start=store.last_sequence() + 1)]
     store.commit([StoredResult.of(result, recorded=True, recording=RECORDING) for result in results])
     store.close()
 
@@ -153,7 +153,7 @@ def _rests() -> tuple[np.ndarray, np.ndarray]:
 
 def _companions(site: Path, time_s: np.ndarray, v: np.ndarray) -> dict[str, str]:
     """Write valid files; returns their paths. The sensor is moved along a direction of its own in each position."""
-    motion = sum(np.sin(2 * np.pi * f * time_s + f) for f in (3.1, 5.3, 8.7))
+    motion = np.sum([np.sin(2 * np.pi * f * time_s + f) for f in (3.1, 5.3, 8.7)], axis=0)
     along = np.repeat(np.roll(UP, 1, axis=1), REST_S * RATE_HZ, axis=0)
     _csv(site / "rests.csv", "time_s,vx,vy,vz", time_s, v)
     _csv(site / "sensor.csv", "time_s,vx,vy,vz", time_s, v + motion[:, None] * along)
@@ -195,7 +195,7 @@ def _tables(site: Path, time_s: np.ndarray, v: np.ndarray) -> list[tuple[str, st
     return made
 
 
-def _columns(time_s: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+def _columns(time_s: np.ndarray, v: np.ndarray) -> dict[str, Any]:
     return {"time_s": time_s, "vx": v[:, 0], "vy": v[:, 1], "vz": v[:, 2]}
 
 

@@ -115,7 +115,7 @@ def _of_text(valid: bytes, draw: random.Random) -> bytes:
                 to = draw.randrange(len(lines))
                 lines[at], lines[to] = lines[to], lines[at]
             case _:
-                tokens = list(_TOKEN.finditer(lines[at])) or [re.compile("").match(lines[at])]
+                tokens = list(_TOKEN.finditer(lines[at])) or list(re.finditer("^", lines[at]))
                 token = draw.choice(tokens)
                 assert token is not None
                 lines[at] = lines[at][: token.start()] + draw.choice(WORDS) + lines[at][token.end() :]

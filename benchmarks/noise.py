@@ -11,6 +11,9 @@ the windows from which the agent learns: after how many windows that is told, th
 from __future__ import annotations
 
 import os
+from typing import Any
+
+from numpy.typing import NDArray
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -61,7 +64,7 @@ def drawn(random: np.random.Generator, sound: Sound, times: Array) -> Iterator[t
         yield motion, np.hypot(factor * FLOOR_MPS2, sound.part * motion) * np.exp(own)
 
 
-def told(random: np.random.Generator, sound: Sound, times: Array) -> list[int]:
+def told(random: np.random.Generator, sound: Sound, times: NDArray[Any]) -> list[int]:
     """The numbers of the windows at which something is told."""
     watch = NoiseHistory()
     windows = enumerate(drawn(random, sound, times))

@@ -14,7 +14,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -76,8 +75,8 @@ def files(world: World, seed: int, tally: Tally) -> None:
         tally.crashes += 1
         return
     tally.valid += found.status == "valid"
-    error = found.values[:9] - of.sensitivity.ravel()
-    tally.add(error, found.standard_uncertainty[:9], found.coverage_factor, found.determined[:9])
+    away = found.values[:9] - of.sensitivity.ravel()
+    tally.add(away, found.standard_uncertainty[:9], found.coverage_factor, found.determined[:9])
 
 
 def online(world: World, seed: int, tally: Tally) -> None:
@@ -86,7 +85,7 @@ def online(world: World, seed: int, tally: Tally) -> None:
     S, plane = np.eye(3) + U_PRIOR * random.normal(size=(3, 3)), orthonormal(random)
     stated = Priors(offset_mps2=1e-3, lag_window_s=0.0, rotation_rad=U_ROTATION, reference=U_REFERENCE)
     u = np.append(U_PRIOR.ravel(), np.full(3, 20.0))
-    walk = replace(Wander.none(), offset_rate_mps2=1e-9)
+    walk = Wander({**Wander.none().values, "offset_rate_mps2": 1e-9})
     state = State(np.append(np.eye(3), np.zeros(3)), u, stated, walk, TemperatureModel(), fixed=True)
     for day, window in enumerate(_visits(world, S, plane, seed)):
         state.update(Record.of(window, float(day)))

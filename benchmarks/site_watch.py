@@ -180,7 +180,7 @@ def sound(seed: int, sensors: int, count: Counter[str]) -> None:
     """A sound site for two years: alarms by kind."""
     bridge = Bridge(seed, sensors, GATEWAYS[sensors])
     bridge.hour = 24 * (61 * seed % 365)
-    watch, last = SiteWatch(bridge.gateway, BANDS_HZ), {}
+    watch, last = SiteWatch(bridge.gateway, BANDS_HZ), dict[tuple[tuple[str, int], str], int]()
     for number, hours in enumerate(bridge.days(SITE_DAYS)):
         watch.update(day_of(hours, BANDS_HZ))
         if number < FIRST_LOOK or number % 7:
@@ -303,10 +303,10 @@ def cost() -> str:
     for sensors in GATEWAYS:
         bridge = Bridge(1, sensors, GATEWAYS[sensors])
         hours = list(bridge.days(10))
-        merge, few = used(lambda hours=hours: [day_of(one, BANDS_HZ) for one in hours])
+        merge, few = used(lambda hours=hours: [day_of(one, BANDS_HZ) for one in hours])  # type: ignore[misc]
         watch = SiteWatch(bridge.gateway, BANDS_HZ)
-        whole, _ = used(lambda few=few, watch=watch: [watch.update(_later(few[k % 10], k)) for k in range(365)])
-        read, _ = used(lambda watch=watch: result(watch))
+        whole, _ = used(lambda few=few, watch=watch: [watch.update(_later(few[k % 10], k)) for k in range(365)])  # type: ignore[misc]
+        read, _ = used(lambda watch=watch: result(watch))  # type: ignore[misc]
         size = sum(part.nbytes for part in arrays(watch.snapshot())) / 1e3 / sensors
         lines.append(f"| {sensors} | {whole:.2f} | {read:.2f} | {size:.0f} | {100.0 * merge:.1f} |")
         print(lines[-1], flush=True)
@@ -420,7 +420,7 @@ def _kept(sensors: int, engine: Sqlite) -> str:
     bridge.hour = 24 * first
     results = [one for hours in bridge.days(3) for one in _received(hours, bridge)]
     batches = [results[k : k + 100] for k in range(0, len(results), 100)]
-    taken, _ = used(lambda: [database.add(batch) for batch in batches])
+    taken, _ = used(lambda: [database.add(batch) for batch in batches])  # type: ignore[func-returns-value]
     while close_day(database.query) is not None:
         pass
     ((hour,),) = database.query("SELECT avg(length(payload)) FROM watch_hour")

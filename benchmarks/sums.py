@@ -134,7 +134,8 @@ def main() -> None:
     u, du, V = signals(SAMPLES, rng)
     rates = {
         f"window sums, segments of {size} samples": rate(
-            lambda size=size: window_sums(u, du, V, np.arange(0, SAMPLES + 1, size)), SAMPLES
+            lambda size=size: window_sums(u, du, V, np.arange(0, SAMPLES + 1, size)),  # type: ignore[misc]
+            SAMPLES,
         )
         for size in (500, 1000, 4000)
     }

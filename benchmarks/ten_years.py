@@ -9,6 +9,7 @@ walk; four steps are stated. Merged are the records once in ten days, as an agen
 from __future__ import annotations
 
 import os
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -39,7 +40,7 @@ SEEDS = (1,)
 NAMES = "ABCDEFGHIJ"
 
 
-def stated(walks: dict[str, float]) -> Statements:
+def stated(walks: dict[str, Any]) -> Statements:
     """What is stated of the sensor and of ten references."""
     priors = Priors(reference=2e-3, reference_drift=5e-3, offset_mps2=0.02)
     certified = {name: YEAR_DAYS * k for k, name in enumerate(NAMES)}
@@ -66,7 +67,7 @@ class Compared:
     seconds: tuple[float, float]
 
 
-def years(walks: dict[str, float], seed: int) -> Iterator[Compared]:
+def years(walks: dict[str, Any], seed: int) -> Iterator[Compared]:
     """The end of each year."""
     random, statements = np.random.default_rng(seed), stated(walks)
     days = np.arange(0.0, YEARS * YEAR_DAYS, EVERY_DAYS)

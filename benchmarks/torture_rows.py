@@ -85,8 +85,8 @@ def _across(random: np.random.Generator) -> BenchParameters:
 
 
 _DEGREE = float(np.deg2rad(1.0))
-_ANGLES = replace(FIXED, angle_rad=ANGLE_DEG * _DEGREE, theta_rad=ANGLE_DEG * _DEGREE)
-_ANGLES_AND_OFFSETS = replace(_ANGLES, offset_mps2=OFFSET_MPS2)
+_ANGLES = FIXED.with_values({"angle_rad": ANGLE_DEG * _DEGREE, "theta_rad": ANGLE_DEG * _DEGREE})
+_ANGLES_AND_OFFSETS = _ANGLES.with_values({"offset_mps2": OFFSET_MPS2})
 
 ROWS = (
     Row("none (white noise 0.02 m/s²)", lambda _: _bench(), mended=True),
@@ -96,21 +96,22 @@ ROWS = (
     Row("velocity reference (0.2 mm/s of noise)", _velocity, mended=True),
     Row("clamp angles known to 0.2°", _spread(_bench(), angle_deg=ANGLE_DEG, theta_deg=ANGLE_DEG), _ANGLES),
     Row("offset differs by 0.05 m/s² between windows", _spread(_bench(), offset_mps2=OFFSET_MPS2),
-        replace(FIXED, offset_mps2=OFFSET_MPS2)),
+        FIXED.with_values({"offset_mps2": OFFSET_MPS2})),
     Row("six positions, angles and offsets", _spread(_bench(SIX), angle_deg=ANGLE_DEG, theta_deg=ANGLE_DEG,
                                                       offset_mps2=OFFSET_MPS2), _ANGLES_AND_OFFSETS),
     Row("coloured noise, AR(1) 0.99, 0.02 m/s²",
         lambda _: _sensor(_bench(), noise_mps2=0.002, coloured_noise_mps2=NOISE_MPS2)),
     Row("common alpha off by 0.1°", _spread(_bench(), alpha_common_deg=0.1),
-        replace(FIXED, alpha_common_rad=0.1 * _DEGREE)),
+        FIXED.with_values({"alpha_common_rad": 0.1 * _DEGREE})),
     Row("theta by position, 0.1°", _spread(_bench(), theta_position_deg=0.1),
-        replace(FIXED, theta_position_rad=0.1 * _DEGREE)),
+        FIXED.with_values({"theta_position_rad": 0.1 * _DEGREE})),
     Row("offset by position, 0.05 m/s²", _spread(_bench(), offset_position_mps2=OFFSET_MPS2),
-        replace(FIXED, offset_position_mps2=OFFSET_MPS2)),
+        FIXED.with_values({"offset_position_mps2": OFFSET_MPS2})),
     Row("reference AC-coupled at 0.16 Hz ± 20 %, 0.5-8 Hz", _corner,
-        replace(FIXED, reference_corner_hz=0.2 * CORNER_HZ, reference_corner_at_hz=CORNER_HZ, offset_mps2=OFFSET_MPS2)),
-    Row("5 % of motion across, unseen by the reference", _across, replace(FIXED, transverse=0.05)),
-    Row("g known to 0.03 m/s²", _spread(_bench(), gravity_mps2=0.03), replace(FIXED, gravity_mps2=0.03)),
-    Row("reference known to 0.1 %", _spread(_bench(), reference_pct=0.1), replace(FIXED, reference=1e-3)),
+        FIXED.with_values({"reference_corner_hz": 0.2 * CORNER_HZ, "reference_corner_at_hz": CORNER_HZ,
+                           "offset_mps2": OFFSET_MPS2})),
+    Row("5 % of motion across, unseen by the reference", _across, FIXED.with_values({"transverse": 0.05})),
+    Row("g known to 0.03 m/s²", _spread(_bench(), gravity_mps2=0.03), FIXED.with_values({"gravity_mps2": 0.03})),
+    Row("reference known to 0.1 %", _spread(_bench(), reference_pct=0.1), FIXED.with_values({"reference": 1e-3})),
     Row("all together", _all_together, _ANGLES_AND_OFFSETS),
 )  # fmt: skip

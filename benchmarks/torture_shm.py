@@ -64,7 +64,7 @@ def one(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     plain = windows(recording, Settings(limit_band=False))
     loud = {(w.start_s, w.stop_s) for w in plain if w.kind == "motion"}
     naive = fit([replace(w, used=(w.start_s, w.stop_s) in loud, reason="") for w in plain]).calibration.sensitivity
-    found = adjust(windows(recording, Settings()), replace(FIXED, offset_mps2=0.05))
+    found = adjust(windows(recording, Settings()), FIXED.with_values({"offset_mps2": 0.05}))
     u = np.sqrt(np.diag(found.covariance)[:9])
     return naive.ravel() - S_TRUE.ravel(), found.mean[:9] - S_TRUE.ravel(), u, found.coverage_factor
 
@@ -77,7 +77,7 @@ def windows(recording: BenchRecording, settings: Settings) -> list[Window]:
     for span_s in pieces_of(0.0, SECONDS, settings.limits.longest_s, 1.0):
         parts = sensor.cut(*span_s), reference.cut(span_s[0] - 1.0, span_s[1] + 1.0)
         assert parts[0] is not None
-        found += windows_of(pose, *parts, Instrument(), span_s, settings=settings)
+        found += windows_of(pose, parts[0], parts[1], Instrument(), span_s, settings=settings)
     return found
 
 

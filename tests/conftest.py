@@ -121,9 +121,11 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 @pytest.fixture(autouse=True)
 def _signals_as_before() -> Iterator[None]:
     """A run that a test makes in this process ends with its signals ignored, and so would every later child: a pool of
-    processes then waits for ever for workers that it tells to end."""
+    processes then waits for ever for workers that it tells to end. A file to which the interpreter writes at a signal
+    is closed with the run that opened it, and its number may be that of any other file then."""
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)}
     yield
+    signal.set_wakeup_fd(-1)
     for number, handler in before.items():
         if handler is not None and signal.getsignal(number) is not handler:
             signal.signal(number, handler)

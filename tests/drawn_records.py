@@ -40,9 +40,7 @@ class Truth:
     lag_s: np.ndarray = field(default_factory=_none)  # of the axes
 
 
-def template(
-    pose: Pose, level_mps2: tuple[float, float, float] = (1.0, 1.0, 1.0), noise: float = 1e-6, seed: int = 1
-) -> Record:
+def template(pose: Pose, level_mps2: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 1e-6, seed: int = 1) -> Record:
     """A record of this pose with three tones in each channel of its reference, and white noise of this SD a point."""
     random, m = np.random.default_rng(seed), pose.direction.shape[1]
     t = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from calib.estimate.nuisances import Priors
@@ -23,10 +25,10 @@ S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01
 Q_TRUE = np.array([0.36, -0.06, 0.165])
 DEGREE = float(np.deg2rad(1.0))
 ANGLES = {"angle_rad": 0.2 * DEGREE, "theta_rad": 0.2 * DEGREE, "offset_mps2": 0.05}
-EXACT = Priors(**{**Priors.none().values, "lag_s": 0.02})
+EXACT = Priors.none().with_values({"lag_s": 0.02})
 
 
-def bench(motion_hz: float, **sensor: object) -> BenchParameters:
+def bench(motion_hz: float, **sensor: Any) -> BenchParameters:
     stands = tuple(clamped(35.0, alpha, 2.0) for alpha in (0.0, 30.0, 120.0, 210.0))
     made = SensorParameters(sensitivity=S_TRUE, offset=Q_TRUE, noise_mps2=0.02, **sensor)  # type: ignore[arg-type]
     return BenchParameters(schedule=Schedule(stands, turn_s=1.0), motion=sine(motion_hz, 10.0), sensor=made)

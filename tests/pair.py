@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +22,14 @@ from calib.recorded.tables import Making, Tables
 from calib.signal.instrument import Instrument
 from calib.signal.known_response import UNKNOWN, KnownResponse
 
-Complex = NDArray[np.complex128]
-Filter = Callable[[Array], Complex]
+Complex = NDArray[Any]  # complex numbers, of the precision that the function gives
+Filter = Callable[[NDArray[Any]], Complex]
 
 OFFSET = np.array([0.1, -0.2, 0.3])
 BEYOND_S = 20.0  # at each end, so that no end of the record is an end of the motion
 
 
-def flat(frequency_hz: Array) -> Complex:
+def flat(frequency_hz: NDArray[Any]) -> Complex:
     """Both respond alike."""
     return np.ones(len(frequency_hz), dtype=complex)
 
@@ -110,7 +111,7 @@ def rattle(frequency_hz: float, amplitude_mps2: float) -> Disturbance:
     return added
 
 
-def noise(density: Callable[[Array], Array], *, of_reference: bool = False) -> Disturbance:
+def noise(density: Callable[[NDArray[Any]], NDArray[Any]], *, of_reference: bool = False) -> Disturbance:
     """Noise whose amplitude density at frequencies in Hz is `density`, in m/s2 per root Hz."""
 
     def added(random: np.random.Generator, u: Array, rate_hz: float) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -94,7 +94,7 @@ def made(
     drawn = np.eye(3) + 0.03 * random.normal(size=(3, 3))
     S = drawn if sensitivity is None else sensitivity
     t, k = np.arange(n) / RATE_HZ, world.directions
-    a, u, poses = np.zeros((n, 3)), np.zeros((n, 1 if world.uniaxial else 3)), []
+    a, u, poses = np.zeros((n, 3)), np.zeros((n, 1 if world.uniaxial else 3)), list[Any]()
     turn, gain = U_ROTATION * random.normal(size=3), 1.0 + U_REFERENCE * random.normal(size=u.shape[1])
     random = np.random.default_rng([seed, noise_seed, 1])
     ends = np.linspace(0, n, world.planes + 1).round().astype(int)
@@ -126,5 +126,5 @@ def made(
 
 def calibrated(world: World, of: Made, options: Options | None = None) -> Outcome:
     """What a user gets with these files."""
-    stated = {"nominal": 1.0, "u_nominal_pct": 3.0} if world.nominal else {}
+    stated: dict[str, Any] = {"nominal": 1.0, "u_nominal_pct": 3.0} if world.nominal else {}
     return adjusted(of.files, priors_of(options or Options(reference_coupling="ac", **stated)))

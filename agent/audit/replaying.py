@@ -56,7 +56,7 @@ class ReplayEngine(Protocol):
 class PipelineLike(Protocol):
     """The methods needed of a pipeline in this process; agent.core.pipeline.Pipeline has them."""
 
-    def step(self, event: Event) -> list[Output]: ...
+    def step(self, event: Event) -> Sequence[Output]: ...
     def snapshot(self) -> bytes: ...
     def all_memories(self) -> list[Memory]: ...
 
@@ -269,18 +269,13 @@ class _FileReplay:
             file.notes.append(f"recorded with another {', '.join(other)} than on this machine: last bits may differ")
 
     def _step(self, step: RecordedStep) -> None:
-        file, begins = self._file, isinstance(step.event, RunStart)
+        file = self._file
         try:
-            before = [] if step.complete or begins else self._digests()
-            computed = self._engine.begin(step) if begins else self._engine.step(step)
-            if begins and not cast(RunStart, step.event).continuation:
-                self._found.kept = self._digests()
+            before, computed = self._computed(step)
         except EngineError:
             raise
         except Exception as error:  # a damaged or forged recording may raise any exception
-            kind = "" if begins and isinstance(error, ValueError) else f"{type(error).__name__}: "
-            place = "" if begins else f"the pipeline fails at event {step.event_sequence}: "
-            file.refused = f"{place}{kind}{_short(error)}"
+            file.refused = _refusal(step, error)
             return
         if not step.complete and len(computed) > len(step.results):
             self._left = before
@@ -294,6 +289,23 @@ class _FileReplay:
         found = compare(file.path, step.event_sequence, step.results, computed, file.tolerance, complete=step.complete)
         if found is not None:
             differ(file, found)
+
+    def _computed(self, step: RecordedStep) -> tuple[list[Memory], Sequence[Output]]:
+        """The states before an event that is not complete, and the results of the engine."""
+        if not isinstance(step.event, RunStart):
+            return [] if step.complete else self._digests(), self._engine.step(step)
+        computed = self._engine.begin(step)
+        if not step.event.continuation:
+            self._found.kept = self._digests()
+        return [], computed
+
+
+def _refusal(step: RecordedStep, error: Exception) -> str:
+    """Why a file cannot be replayed."""
+    begins = isinstance(step.event, RunStart)
+    kind = "" if begins and isinstance(error, ValueError) else f"{type(error).__name__}: "
+    place = "" if begins else f"the pipeline fails at event {step.event_sequence}: "
+    return f"{place}{kind}{_short(error)}"
 
 
 def differ(file: ReplayedFile, difference: Difference) -> None:

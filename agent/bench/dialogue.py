@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from agent.bench.capture import Capture
@@ -11,7 +11,7 @@ from agent.bench.measuring import StopInterval
 from agent.bench.screen import BenchScreen, count, pair, told_u
 from agent.bench.session import BenchSession, Outlook, StopFit
 from agent.bench.stops import BenchStop
-from agent.bench.thinking import Thinking
+from agent.bench.thinking import Look, Thinking
 from calib.model import Array
 
 LOOK_S = 1.0  # from one look at the samples to the next
@@ -30,6 +30,24 @@ class StopStay:
 
     least_s: float = 5.0
     most_s: float = 60.0
+
+
+@dataclass(slots=True)
+class _Warnings:
+    """What was said of the present stop: the reason why it cannot be used, and from how many knocks on it is said
+    again."""
+
+    reason: str = ""
+    knocked: int = 0
+
+    def of(self, look: Look, *, told: bool) -> Iterator[str]:
+        """What is wrong and was not said yet. `told`: the stay is long enough for a reason."""
+        if told and look.reason and (reason := look.reason.translate(NO_DIGITS)) != self.reason:
+            self.reason = reason
+            yield look.reason
+        if look.left_out > self.knocked:
+            self.knocked = 2 * look.left_out
+            yield f"knocks: {look.left_out} of {look.points} samples are left out; do not touch the table"
 
 
 class Dialogue:
@@ -202,7 +220,7 @@ class Dialogue:
 
     def _watch(self, stop: BenchStop, start_s: float) -> tuple[StopFit | None, float]:
         """How a stay fits its stop, None where it cannot be used; and when it ended. Says at once what is wrong."""
-        reason, knocked = "", 0
+        warnings = _Warnings()
         told_from_s = REST_TOLD_FROM_S if self._session.expected.rms_mps2 == 0.0 else FIT_FROM_S
         while True:
             time.sleep(LOOK_S)
@@ -217,24 +235,17 @@ class Dialogue:
                 self._show_stay(stop, max(stayed_s, 0.0), None)
                 continue
             look = self._mind.look(self._capture.record(start_s - BEFORE_S), StopInterval(stop, start_s, now_s))
-            if look.reason:
-                if stayed_s >= told_from_s and look.reason.translate(NO_DIGITS) != reason:
-                    self._screen.warn(look.reason)
-                    reason = look.reason.translate(NO_DIGITS)
-                self._show_stay(stop, stayed_s, None)
-                if stayed_s > self._stay.most_s:
-                    return None, now_s
-                continue
-            assert look.fit is not None
-            assert look.expanded is not None
-            if look.left_out > knocked:
-                left_out = f"{look.left_out} of {look.points} samples are left out"
-                self._screen.warn(f"knocks: {left_out}; do not touch the table")
-                knocked = 2 * look.left_out
+            for line in warnings.of(look, told=stayed_s >= told_from_s):
+                self._screen.warn(line)
             self._show_stay(stop, stayed_s, look.expanded)
-            enough = stayed_s >= self._stay.least_s and look.gain < GAIN
-            if enough or not look.fit.fits or stayed_s > self._stay.most_s:
+            if stayed_s > self._stay.most_s or self._is_enough(look, stayed_s):
                 return look.fit, now_s
+
+    def _is_enough(self, look: Look, stayed_s: float) -> bool:
+        """Whether a stop that can be used needs no longer stay, or does not fit."""
+        if look.fit is None:
+            return False
+        return not look.fit.fits or (stayed_s >= self._stay.least_s and look.gain < GAIN)
 
     def _show_stay(self, stop: BenchStop, stayed_s: float, u: Array | None) -> None:
         self._screen.stay(stop, stayed_s, self._stay.least_s, self._stay.most_s, u)

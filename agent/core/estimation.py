@@ -94,6 +94,16 @@ class TrialWindow:
         return self.taken()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Jump:
+    """What held windows ask for together: the state to adopt, None if they do not agree; which device has changed, for
+    the operator; and whether outputs were exchanged or rescaled, which is told at once."""
+
+    state: State | None
+    who: str = ""
+    at_once: bool = False
+
+
 class Estimation:
     """The state, the calibration in force and the held windows. `judge` and commands of an operator change them."""
 
@@ -192,78 +202,101 @@ class Estimation:
     ) -> Judged:
         """Take, hold or refuse one used window. `anew`: the search that found its lag, if there was one."""
         told, whole = self._before_window(day)
-        if anew is None:
-            tried = self._tried_of(window, day, lag_s, temperature_degc)
-        else:
-            if anew.shifted:
-                self.lag_watch.shifted(self.state)
-                self.state = anew.base
-                self.gate.dismiss()  # windows held before were made with another lag
-                self._held = []
+        if anew is not None:
+            self._use_lag(anew)
             record = self._record(window, day, lag_s, temperature_degc)
             tried = TrialWindow(window.sums, record, *self.state.tried(record, at_its_lag=True))
+        else:
+            tried = self._tried_of(window, day, lag_s, temperature_degc)
         self._tried = None
-        record, innovation, trial = tried.record, tried.innovation, tried.after
-        noise_news = self.noise.update(record, self.state.scale)
-        candidate, held = trial.result(), [*self._held, record][-self._channel.gate.confirm_windows :]
-        adopted, who, at_once = self._confirmed(held)
-        same = not self._held or any(held_one.reference == record.reference for held_one in self._held)
-        enough = trial.windows > 1 or window.stop_s - window.start_s >= LEAST_S
-        evidence = Evidence(
-            day * DAY_S, innovation.statistic, innovation.degrees_of_freedom, dismisses=same, enough=enough,
-            still="" if self.gate.calibrated else where_nothing_moved(trial.unexcited),
-        )  # fmt: skip
-        decision = self.gate.judge(evidence, candidate, None if adopted is None else adopted.result())
-        earlier, followed = self.state, ""
+        noise_news, earlier, followed = self.noise.update(tried.record, self.state.scale), self.state, ""
+        candidate = tried.after.result()
+        held = [*self._held, tried.record][-self._channel.gate.confirm_windows :]
+        jump = self._jump(held)
+        decision = self.gate.judge(
+            self._evidence(window, day, tried), candidate, None if jump.state is None else jump.state.result()
+        )
         if decision.action == "take":
-            self.state = trial
+            self.state = tried.after
         elif decision.action == "adopt":
-            assert adopted is not None
-            self.state = adopted
-            whole = self.state.solve()
-            self.drift.restart(innovation.information > 0.0)
-            self.walks.restart()
-            shape = "" if at_once else self._shape(held[0].day, record)
-            decision = replace(decision, reason="; ".join(filter(None, (f"{decision.reason}{who}", shape))))
-        kept = held if decision.action == "hold" else self._held
-        self._held = kept[-self.gate.held :] if self.gate.held else []
+            decision, whole = self._adopt(jump, decision, held[0].day, tried)
+        self._hold(held if decision.action == "hold" else self._held, day * DAY_S, at_once=jump.at_once)
+        if decision.action in ("take", "hold"):
+            told += self._drifted(day, tried.innovation)
+            if not self.gate.held:  # else it is for windows that agree to confirm it
+                followed = self._follow(tried.record)
+        if decision.in_force:
+            self.residual_sd = self.state.residual_sd
+            self._update_in_force(whole, tried.record if decision.action == "take" else None)
+        if decision.action == "hold":
+            self._propose(decision, tried.after if decision.proposal is candidate else jump.state)
+            why = self.lag_watch.beyond or most_likely(tried.innovation, self.state.scale, self.gate.limit)
+            decision = replace(decision, reason=f"{decision.reason}; {why}")
+        news = (noise_news, self._news(earlier) if decision.action in ("take", "adopt") else "", followed)
+        return Judged(decision, tried.innovation, told, "; ".join(filter(None, news)))
+
+    def _use_lag(self, anew: Anew) -> None:
+        """Take the state in which a search has found the lag of the newest window."""
+        if anew.shifted:
+            self.lag_watch.shifted(self.state)
+            self.state = anew.base
+            self.gate.dismiss()  # windows held before were made with another lag
+            self._held = []
+
+    def _evidence(self, window: Window, day: float, tried: TrialWindow) -> Evidence:
+        """What the gate needs of a window."""
+        same = not self._held or any(record.reference == tried.record.reference for record in self._held)
+        return Evidence(
+            day * DAY_S, tried.innovation.statistic, tried.innovation.degrees_of_freedom, dismisses=same,
+            enough=tried.after.windows > 1 or window.stop_s - window.start_s >= LEAST_S,
+            still="" if self.gate.calibrated else where_nothing_moved(tried.after.unexcited),
+        )  # fmt: skip
+
+    def _jump(self, held: Sequence[Record]) -> Jump:
+        """What as many held windows as confirm a jump ask for. Outputs that were exchanged or rescaled are looked for
+        until they are found."""
+        limit = self.gate.limit
+        if len(held) < self._channel.gate.confirm_windows or self.lag_watch.beyond:
+            return Jump(None)
+        adopted, who = confirmed(self.state, held, self._devices, limit)
+        if self._exchanged or (found := exchanged(self.state, held, limit)) is None:
+            return Jump(adopted, who)
+        if found.scale is not None:
+            adopted = rescaled(self.state, held, found.scale, limit) or adopted
+        return Jump(adopted, who, at_once=True)
+
+    def _adopt(self, jump: Jump, decision: Decision, day: float, tried: TrialWindow) -> tuple[Decision, Estimate]:
+        """Go on with the state that held windows ask for, the first of which is of a day. Returns the decision with
+        what the change looks like, and the whole solved anew."""
+        assert jump.state is not None
+        self.state = jump.state
+        whole = self.state.solve()
+        self.drift.restart(tried.innovation.information > 0.0)
+        self.walks.restart()
+        shape = "" if jump.at_once else self._shape(day, tried.record)
+        return replace(decision, reason="; ".join(filter(None, (f"{decision.reason}{jump.who}", shape)))), whole
+
+    def _hold(self, held: Sequence[Record], now_s: float, *, at_once: bool) -> None:
+        """Keep as many of the held windows as the gate does, and note when they are explained next."""
+        self._held = list(held[-self.gate.held :]) if self.gate.held else []
         if self._held and (at_once or self._explain_s is None):
-            self._explain_s = evidence.t_s + (0.0 if at_once else self._channel.gate.explain_after_s)
+            self._explain_s = now_s + (0.0 if at_once else self._channel.gate.explain_after_s)
         self._exchanged |= at_once
         if self._exchanged and not self.gate.held:  # the exchange is over: what it showed is no drift
             self._exchanged = False
             self.drift.restart(np.ones(12, dtype=bool))
-        if decision.action in ("take", "hold"):
-            found = self.drift.update(day * DAY_S, innovation.score, innovation.information)
-            told += [v for v in found if v.verdict != "stable" or v.parameter not in self.walks.drifting]
-            if not self.gate.held:  # else it is for windows that agree to confirm it
-                followed = self._follow(record)
-        if decision.in_force:
-            self.residual_sd = self.state.residual_sd
-            self._update_in_force(whole, record if decision.action == "take" else None)
-        if decision.action == "hold":
-            if decision.proposal is not None:
-                made = trial if decision.proposal is candidate else adopted
-                assert made is not None  # a proposal is one of the two
-                proposal = Proposal(decision.proposal, *made.beyond(self.state), made.shares)
-                self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
-            why = self.lag_watch.beyond or most_likely(innovation, self.state.scale, self.gate.limit)
-            decision = replace(decision, reason=f"{decision.reason}; {why}")
-        news = (noise_news, self._news(earlier) if decision.action in ("take", "adopt") else "", followed)
-        return Judged(decision, innovation, told, "; ".join(filter(None, news)))
 
-    def _confirmed(self, held: Sequence[Record]) -> tuple[State | None, str, bool]:
-        """The state that as many held windows as confirm a jump ask for, which device has changed, and whether outputs
-        were exchanged or rescaled, which is looked for until it is found, and told at once."""
-        limit = self.gate.limit
-        if len(held) < self._channel.gate.confirm_windows or self.lag_watch.beyond:
-            return None, "", False
-        adopted, who = confirmed(self.state, held, self._devices, limit)
-        if self._exchanged or (found := exchanged(self.state, held, limit)) is None:
-            return adopted, who, False
-        if found.scale is not None:
-            return rescaled(self.state, held, found.scale, limit) or adopted, who, True
-        return adopted, who, True
+    def _drifted(self, day: float, innovation: Innovation) -> list[DriftVerdict]:
+        """The verdicts on drift that changed with a window."""
+        changed = self.drift.update(day * DAY_S, innovation.score, innovation.information)
+        return [v for v in changed if v.verdict != "stable" or v.parameter not in self.walks.drifting]
+
+    def _propose(self, decision: Decision, made: State | None) -> None:
+        """Keep the proposal of a decision, if it has one, with the state from which it was made."""
+        if decision.proposal is not None:
+            assert made is not None
+            proposal = Proposal(decision.proposal, *made.beyond(self.state), made.shares)
+            self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
 
     def _news(self, earlier: State) -> str:
         """What the newest window, which was taken, has changed besides S and Q."""

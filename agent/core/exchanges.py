@@ -26,7 +26,7 @@ from agent.config import Channel
 from agent.core.gate import Limit
 from calib.geometry import AXES
 from calib.geometry import STANDARD_GRAVITY_MPS2 as G
-from calib.model import Array, own_channels
+from calib.model import Array, Calibration, own_channels
 from calib.state.state import State
 from calib.windows.record import Record
 
@@ -116,23 +116,33 @@ def exchanged(state: State, held: Sequence[Record], limit: Limit) -> Explained |
     if as_they_are[k].statistic <= most[k]:
         return None
 
-    def without(cause: Exchange, record: Record) -> Record:
-        return cause.undone(record, now.sensitivity, now.offset)
+    def statistic(cause: Exchange, record: Record) -> float:
+        return loose.innovation(cause.undone(record, now.sensitivity, now.offset)).statistic
 
     one_reference = len({record.reference for record in held}) == 1
     tried = [cause for cause in _causes(held[k]) if one_reference or cause.of != "reference"]
-    left = [_left(without(cause, held[k]), now.sensitivity) for cause in tried]
-    near = [cause for cause, own in zip(tried, left, strict=True) if own <= min(left) + NEAR]
-    near = sorted(near, key=lambda cause: loose.innovation(without(cause, held[k])).statistic)[:COMPARED]
-    said = {cause: [loose.innovation(without(cause, record)).statistic for record in held] for cause in near}
+    near = sorted(_near(tried, held[k], now), key=lambda cause: statistic(cause, held[k]))[:COMPARED]
+    said = {cause: [statistic(cause, record) for record in held] for cause in tried if cause in near}
+    return _alike(said, most, sum(own.statistic for own in as_they_are))
+
+
+def _near(causes: Sequence[Exchange], record: Record, now: Calibration) -> list[Exchange]:
+    """The causes without which S alone explains the slopes of a window nearly as well as without the best one."""
+    left = [_left(cause.undone(record, now.sensitivity, now.offset), now.sensitivity) for cause in causes]
+    return [cause for cause, own in zip(causes, left, strict=True) if own <= min(left) + NEAR]
+
+
+def _alike(said: Mapping[Exchange, Sequence[float]], most: Sequence[float], as_it_is: float) -> Explained | None:
+    """The causes that explain all held windows alike, None where none does. `said`: chi-squared of each window without
+    a cause; `most`: of consistent windows."""
     chi2 = {cause: sum(each) for cause, each in said.items()}
     fitting = [cause for cause, each in said.items() if all(x <= y for x, y in zip(each, most, strict=True))]
     if not fitting:
         return None
     best = min(chi2[cause] for cause in fitting)
-    alike = [cause for cause in tried if cause in fitting and chi2[cause] <= best + ALIKE]
+    alike = [cause for cause in fitting if chi2[cause] <= best + ALIKE]
     other = [x for cause, x in chi2.items() if cause not in alike]
-    return Explained(alike, best, sum(own.statistic for own in as_they_are), min(other, default=np.inf))
+    return Explained(alike, best, as_it_is, min(other, default=np.inf))
 
 
 def explanation(found: Explained, channel: Channel, since: str, held: int, number: int | None) -> str:

@@ -67,42 +67,43 @@ def explained(
     `jump` (12,) sets S and Q free, 0 where the windows tell nothing of them. `number` of the newest estimate from held
     windows that can be accepted, None if there is none.
     """
-    limit, fixed_mount = gate.limit, channel.fixed_mount
     alone = state.chi2_beside(held)
     before, by_chance = state.after(held, {}).chi2 - alone, sum(record.rows for record in held)
-    sound = limit(by_chance)
+    sound = gate.limit(by_chance)
     said = (
         f"{len(held)} held windows contradict the state: chi-squared {before:.0f}, {sound:.0f} at most if it is right."
         if before > sound
         else f"{len(held)} held windows agree with what the state may have become since its last window (chi-squared "
         f"{before:.0f}, {sound:.0f} at most)."
     )
-    found = sorted(
-        (
-            _with(state, held, jump, gate, line, members, alone)
-            for line, members in _lines(state, jump, fixed_mount).items()
-        ),
-        key=lambda e: e.score,
-    )
-    left = found[0].chi2 - by_chance if found else before
-    if not found or before < found[0].score + DECISIVE or before - by_chance < WORTH * left:
+    lines = _lines(state, jump, channel.fixed_mount)
+    tried = [_with(state, held, jump, gate, line, members, alone) for line, members in lines.items()]
+    alike = _alike(tried, before, by_chance)
+    if not alike:
         accept = "" if number is None or before > sound else f", or {_accepting(number)}"
         return f"{said} No known explanation fits them better. {COMPARE}{accept}"
     # Of those that fit alike, the one with the fewest unknowns: a mount that turned is also a change of all S.
-    best = min((e for e in found if e.score < found[0].score + DECISIVE), key=lambda e: len(e.members))
+    best = min(alike, key=lambda e: len(e.members))
     fits = "Best fits" if best.chi2 <= sound else "Nearest, though not within what chance allows, is"
     # Of another filter, only windows tell all that were made for it.
     helps = best.chi2 <= sound or best.most.kind is RESPONSE
-    alike = [
-        _told(e, state.scale)
-        for e in found
-        if e is not best and e.score < found[0].score + DECISIVE and not best.members < e.members
-    ]
-    others = f" As well fits: {'; '.join(alike)}." if alike else ""
+    others = [_told(e, state.scale) for e in alike if e is not best and not best.members < e.members]
+    as_well = f" As well fits: {'; '.join(others)}." if others else ""
     return (
-        f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}.{others} "
+        f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}.{as_well} "
         f"{_remedy(best, state.scale, channel, number) if helps else best.unfit or COMPARE}"
     )
+
+
+def _alike(tried: Sequence[Explanation], before: float, by_chance: int) -> list[Explanation]:
+    """The explanations that fit as well as the best one, which is first; none where it is no better than none.
+
+    `before`: chi-squared without an explanation; `by_chance`: that of sound windows.
+    """
+    found = sorted(tried, key=lambda e: e.score)
+    if not found or before < found[0].score + DECISIVE or before - by_chance < WORTH * (found[0].chi2 - by_chance):
+        return []
+    return [e for e in found if e.score < found[0].score + DECISIVE]
 
 
 def _lines(state: State, jump: Array, fixed_mount: bool) -> dict[str, list[int]]:
@@ -112,18 +113,27 @@ def _lines(state: State, jump: Array, fixed_mount: bool) -> dict[str, list[int]]
     """
     quantities, lines, own = state.quantities, dict[str, list[int]](), {quantity.key for quantity in state.present}
     for k, quantity in enumerate(quantities):
-        kind = quantity.kind
         if quantity.key not in own or quantity.name in ALL_RATES:
             continue
-        stated = kind.source and _setting(kind, fixed_mount) and not (fixed_mount and "lean" in kind.loosened_by)
-        stated = stated or kind is RESPONSE
-        if jump[k] > 0.0 if k < len(jump) else stated:
-            lines.setdefault(kind.name if k < len(jump) else kind.source, []).append(k)
+        if k >= len(jump):
+            line = quantity.kind.source if _may_be_free(quantity.kind, fixed_mount) else ""
+        else:
+            line = quantity.kind.name if jump[k] > 0.0 else ""
+        if line:
+            lines.setdefault(line, []).append(k)
     if fixed_mount and OFFSET.name in lines:
         # A sensor that was turned on its mount has another mean output, too.
         turned = {line: members for line, members in lines.items() if quantities[members[0]].kind.unit == "rad"}
         lines |= {f"{line}, with its mean output": [*m, *lines[OFFSET.name]] for line, m in turned.items()}
     return lines
+
+
+def _may_be_free(kind: Kind, fixed_mount: bool) -> bool:
+    """Whether a kind of unknown besides S and Q has a line of the budget, and may be other than somebody states."""
+    if kind is RESPONSE:
+        return True
+    leans = fixed_mount and "lean" in kind.loosened_by
+    return bool(kind.source) and not leans and _setting(kind, fixed_mount) is not None
 
 
 def _with(

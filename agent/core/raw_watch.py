@@ -72,14 +72,7 @@ class RawWatch:
         anew, repeats = bool(int(block.flags) & UNCOUNTED), outputs.repeats
         outputs.update(block.first_index, x, block.nominal_rate_hz, block.burst_count, anew=anew)
         now_s = (block.t_monotonic_ns - stream.origin_ns) * 1e-9
-        told, faults = [], list[OutputFault]()
-        for fault in self._faults.get(block.device, []):
-            if fault.stop_s == np.inf and fault.held is not None and (anew or not outputs.goes_on(fault.held)):
-                if now_s - fault.start_s >= WORTH_S:
-                    told.append(f"{fault.said}; now it changes again")
-                faults.append(replace(fault, stop_s=now_s))
-            elif fault.stop_s > now_s - self._keep_s:
-                faults.append(fault)
+        told, faults = self._going_on(block.device, outputs, now_s, anew=anew)
         known = {fault.held.axis for fault in faults if fault.held is not None and fault.stop_s == np.inf}
         for held in outputs.held(expected):
             if held.axis not in known:
@@ -92,6 +85,21 @@ class RawWatch:
             faults.append(OutputFault(f"{block.device}: its driver gave the same samples twice", start_s, now_s))
         self._faults[block.device] = faults
         return told + list(self._now_and_then(block.device, outputs, now_s))
+
+    def _going_on(
+        self, device: str, outputs: Outputs, now_s: float, *, anew: bool
+    ) -> tuple[list[str], list[OutputFault]]:
+        """The faults of a device that go on or that windows may still ask for, and messages on outputs that change
+        again. `anew`: the counter of the device began anew."""
+        told, faults = [], list[OutputFault]()
+        for fault in self._faults.get(device, []):
+            if fault.stop_s == np.inf and fault.held is not None and (anew or not outputs.goes_on(fault.held)):
+                if now_s - fault.start_s >= WORTH_S:
+                    told.append(f"{fault.said}; now it changes again")
+                faults.append(replace(fault, stop_s=now_s))
+            elif fault.stop_s > now_s - self._keep_s:
+                faults.append(fault)
+        return told, faults
 
     def reason(self, devices: Iterable[str], start_s: float, stop_s: float) -> str:
         """What is wrong with one of the devices between two times; "" if nothing is."""

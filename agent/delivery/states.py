@@ -118,22 +118,38 @@ def states_at_start(
     if key is not None and _is_new(connection, directory, files.values()):
         states.faults.append(f"nothing in {directory} is signed: this start takes over once what is not signed")
         keys = None
-    path = next((path for path in reversed(files.values()) if first_event(path) is not None), None)
-    if path is not None:
-        number, last = _reached(path, key)
-        states.late = states.recording < number or states.sequence < last
-        if states.late and not (lost or behind):
-            states.faults.append("the states of the estimation in the store are older than the newest recording")
-        if behind or lost or states.late:
-            found = recall(files.pop(final_name(path)), keys)
-            _take_from(states, found, number, path.name, signed=key is not None)
-            lost = lost or found is None
-        states.recording, states.sequence = max(states.recording, number), max(states.sequence, last)
-    if lost:
+    if _take_newest(files, recall, key, keys, states, behind=behind, lost=lost):
         _take_calibrated(connection, files, recall, keys, states, end_s)
         if key is not None:
             _begin_from_calibrations(connection, key, states)
     return states
+
+
+def _take_newest(
+    files: dict[str, Path],
+    recall: Recall,
+    key: GatewayKey | None,
+    keys: KnownKeys | None,
+    states: States,
+    *,
+    behind: bool,
+    lost: bool,
+) -> bool:
+    """Take the states where the newest recording ends, if they may be newer than those in the store. Returns whether
+    states may be lost: they were before, or this recording does not give them."""
+    path = next((path for path in reversed(files.values()) if first_event(path) is not None), None)
+    if path is None:
+        return lost
+    number, last = _reached(path, key)
+    states.late = states.recording < number or states.sequence < last
+    if states.late and not (lost or behind):
+        states.faults.append("the states of the estimation in the store are older than the newest recording")
+    if behind or lost or states.late:
+        found = recall(files.pop(final_name(path)), keys)
+        _take_from(states, found, number, path.name, signed=key is not None)
+        lost = lost or found is None
+    states.recording, states.sequence = max(states.recording, number), max(states.sequence, last)
+    return lost
 
 
 def _stored(connection: sqlite3.Connection, key: GatewayKey | None, epoch: str) -> States:

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
@@ -327,10 +328,8 @@ class Fleet:
             doubled = gateway in self._mixed_utc_ns
             of = {"heard_utc_ns": self._heard[place].at_ns, "changed": self._changed[place]}
             retired = not self._retired.isdisjoint(("/".join(gateway), "/".join(place)))
-            row = _row(
-                place, self._newest[place], self._state_of(gateway), self._suspected.get(place), heard=heard,
-                doubled=doubled, retired=retired,
-            )  # fmt: skip
+            presence = _Presence(self._state_of(gateway), heard, doubled, retired)
+            row = _row(place, self._newest[place], presence, self._suspected.get(place))
             self._made[place] = row | of
         return self._made[place]
 
@@ -443,44 +442,60 @@ def kind_of(
 _OF_STATUS: dict[str, Kind] = {"VALID": "sound", "RECALIBRATING": "sound", "HELD": "held", "INVALID": "no data"}
 
 
+@dataclass(frozen=True, slots=True)
+class _Presence:
+    """What is known of a sensor apart from its results. `gateway`: the state of its gateway; `heard`: results of the
+    sensor come; `doubled`: two gateways have the name of its own; `retired`: it was taken down."""
+
+    gateway: str
+    heard: bool
+    doubled: bool
+    retired: bool
+
+
+def _why(
+    status: Mapping[str, Any], verdicts: Sequence[Mapping[str, Any]], presence: _Presence, suspicion: Suspicion | None
+) -> list[str]:
+    """Why the sensor is not sound, or is not heard."""
+    why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
+    if status.get("status") in NEEDS_A_PERSON:
+        why.insert(0, f"{status['status']}: {status['reason']}")
+    if presence.retired and not presence.heard:
+        why = ["it was taken down"]
+    elif presence.gateway == "silent":
+        why.append("the gateway is not on the bus")
+    elif not presence.heard:
+        why.append(f"no result for {SILENT_INTERVALS} intervals")
+    if presence.doubled:
+        why.append("two gateways have one name")
+    if suspicion is not None:
+        why.append(f"suspected: {suspicion.text}")
+    return why
+
+
 def _row(
-    place: Place, newest: dict[str, dict[str, Any]], gateway_state: str, suspicion: Suspicion | None, *, heard: bool,
-    doubled: bool, retired: bool,
-) -> dict[str, Any]:  # fmt: skip
+    place: Place, newest: dict[str, dict[str, Any]], presence: _Presence, suspicion: Suspicion | None
+) -> dict[str, Any]:
     status, calibration = newest.get("status", {}), newest.get("calibration", {})
     verdicts = sorted(_verdicts(newest), key=lambda drift: -_in_u(drift, calibration))
     u_pct, u_axis = _largest_u(calibration)
     reference, calibrated_utc_ns = dated(_reference(newest))
-    told = ["drifting" if drift["drifts"] else "stepped" for drift in verdicts]
-    why = [f"{drift['parameter']} {drift['verdict']}: {drift['reason']}" for drift in verdicts]
-    if status.get("status") in NEEDS_A_PERSON:
-        why.insert(0, f"{status['status']}: {status['reason']}")
-    if retired and not heard:
-        why = ["it was taken down"]
-    elif gateway_state == "silent":
-        why.append("the gateway is not on the bus")
-    elif not heard:
-        why.append(f"no result for {SILENT_INTERVALS} intervals")
-    if doubled:
-        why.append("two gateways have one name")
-    if suspicion is not None:
-        why.append(f"suspected: {suspicion.text}")
     return {
         "site": place[0],
         "gateway": place[1],
         "sensor": place[2],
         "kind": kind_of(
-            told,
+            ["drifting" if drift["drifts"] else "stepped" for drift in verdicts],
             status.get("status", ""),
-            heard=heard,
-            doubled=doubled,
-            retired=retired,
+            heard=presence.heard,
+            doubled=presence.doubled,
+            retired=presence.retired,
             suspected=suspicion is not None,
         ),
         "status": status.get("status", ""),
         "status_utc_ns": status.get("t_utc_ns"),
         "reason": clipped(status.get("reason", "")),
-        "gateway_state": gateway_state,
+        "gateway_state": presence.gateway,
         "verdicts": [{name: drift[name] for name in (*VERDICT, *SINCE_STABLE)} for drift in verdicts],
         "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
         "u_pct": u_pct,
@@ -495,7 +510,7 @@ def _row(
         "last_good_utc_ns": newest.get("good window", {}).get("t_utc_ns"),
         "result_utc_ns": max(fields["t_utc_ns"] for fields in newest.values()),
         "verified": bool(newest) and all(fields.get("signed_by") for fields in newest.values()),
-        "why": "; ".join(clipped(reason) for reason in why),
+        "why": "; ".join(clipped(reason) for reason in _why(status, verdicts, presence, suspicion)),
     }
 
 

@@ -72,11 +72,10 @@ class Trends:
         fitted = _used_times(history, windows)
         found = {v["parameter"]: _trend(v, from_then, ends, fitted) for v in verdicts}
         begun = [trend["began_utc_ns"][0] for trend in found.values()] + ([] if held is None else [held])
-        shown = _plotted(history, first) | {
+        shown = _plotted(history, first) | _compared(*ends)
+        shown |= {
             "accepted": accepted > 0,
             "accepted_utc_ns": first["t_utc_ns"],
-            "changes": [change_of(*ends, i) for i in range(len(PARAMETERS))],
-            "budget": {source: [u[i] for i in MAIN] for source, u in ends[1].get("budget", {}).items()},
             "held_utc_ns": _lasting(statuses),
             "adopted_utc_ns": _adopted_since(statuses, accepted),
             "certificate_utc_ns": _certificate_since(history),
@@ -163,6 +162,14 @@ def _plotted(history: Sequence[Mapping[str, Any]], first: Mapping[str, Any]) -> 
     return {
         "t_utc_ns": [c["t_utc_ns"] for c in shown],
         "main_pct": [[_pct(first, c, i) for c in shown] for i in MAIN],
+    }
+
+
+def _compared(first: Mapping[str, Any], last: Mapping[str, Any]) -> dict[str, Any]:
+    """The change of each parameter from one calibration to another, and the budget of the main sensitivities."""
+    return {
+        "changes": [change_of(first, last, i) for i in range(len(PARAMETERS))],
+        "budget": {source: [u[i] for i in MAIN] for source, u in last.get("budget", {}).items()},
     }
 
 

@@ -113,11 +113,8 @@ def _parts(file: BinaryIO, size: int) -> Iterator[Part]:
         opcode, length = _HEAD.unpack(head)
         if opcode in (Opcode.DATA_END, Opcode.FOOTER):
             return
-        if not 0 < opcode < Opcode.DATA_END and opcode < PRIVATE:
-            raise _FaultError(at, opcode, "MCAP has no such kind of record")
         there = size - at - _HEAD.size
-        if opcode in (*TAKEN, Opcode.CHUNK) and CHUNK_LIMIT < length <= there:
-            raise _FaultError(at, opcode, f"its {length} bytes are more than the limit of {CHUNK_LIMIT}")
+        _check_head(at, opcode, length, there)
         if opcode == Opcode.CHUNK:
             body = file.read(min(length, there, CHUNK_LIMIT))
             data, whole = _content(at, body, length, max(0, most_unpacked(at + len(body)) - unpacked))
@@ -134,6 +131,14 @@ def _parts(file: BinaryIO, size: int) -> Iterator[Part]:
             yield at, opcode, memoryview(file.read(length))
         at += _HEAD.size + length
         file.seek(at)
+
+
+def _check_head(at: int, opcode: int, length: int, there: int) -> None:
+    """Check what the head of a record states; so many bytes are `there`. Raises _FaultError."""
+    if not 0 < opcode < Opcode.DATA_END and opcode < PRIVATE:
+        raise _FaultError(at, opcode, "MCAP has no such kind of record")
+    if opcode in (*TAKEN, Opcode.CHUNK) and CHUNK_LIMIT < length <= there:
+        raise _FaultError(at, opcode, f"its {length} bytes are more than the limit of {CHUNK_LIMIT}")
 
 
 def _inside(at: int, data: bytes, whole: bool) -> Iterator[Part]:

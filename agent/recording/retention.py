@@ -122,10 +122,7 @@ class Retention:
 
     def _for_space(self, candidates: Sequence[_File], at: Moment) -> _File | None:
         keep, free = self._keep, free_bytes(self._directory)
-        urgent = bool(keep.least_free_bytes) and (at.quota or free < min(OWN_ROOM_BYTES, keep.least_free_bytes))
-        short = urgent or free < keep.least_free_bytes
-        self._short_ns = _since(self._short_ns, at.now_ns) if short else None
-        self._urgent_ns = _since(self._urgent_ns, at.now_ns) if urgent else None
+        urgent, short = self._lack(free, at)
         deletable = list(_free(candidates)) if short else []
         old = [file for file in deletable if _age_days(file, at) > keep.at_least_days]
         helps = free + sum(file.size for file in old) >= keep.least_free_bytes
@@ -139,6 +136,15 @@ class Retention:
             _log.warning("%s is deleted though it is younger than %s: the disk is almost full", chosen.path, days)
         self._deleted_ns, self._expected = at.now_ns, free + chosen.size // 2
         return chosen
+
+    def _lack(self, free: int, at: Moment) -> tuple[bool, bool]:
+        """Whether the agent's own room is lacking, and whether free space is; and since when."""
+        least = self._keep.least_free_bytes
+        urgent = bool(least) and (at.quota or free < min(OWN_ROOM_BYTES, least))
+        short = urgent or free < least
+        self._short_ns = _since(self._short_ns, at.now_ns) if short else None
+        self._urgent_ns = _since(self._urgent_ns, at.now_ns) if urgent else None
+        return urgent, short
 
     def _earliest_ns(self, free: int) -> int:
         """Event time before which nothing is deleted for free space."""

@@ -78,6 +78,8 @@ class Day:
 def world(seed: int, rate_hz: float = RATES_HZ[0]) -> Bench:
     """The bench of the day. Sensor and reference sample at `rate_hz` and are read like the drivers of hw read."""
     p = plain(seed)
+    assert p.sensor.bursts is not None
+    assert p.reference.bursts is not None
     stands = tuple(clamped(theta_deg, alpha_deg, HOLD_S) for theta_deg, alpha_deg in STOPS)
     turned = replace(
         p,

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from agent.config import Config
@@ -122,7 +123,7 @@ class Bridge(Building):
         pad_s = 15.0  # the bridge does not stand still before a window, nor an AC reference
         points = round((stop_s - start_s + 2.0 * pad_s) * GRID_HZ)
         time_s = start_s - pad_s + np.arange(points) / GRID_HZ
-        frequency_hz: Array = np.fft.rfftfreq(points, 1.0 / GRID_HZ)
+        frequency_hz = np.asarray(np.fft.rfftfreq(points, 1.0 / GRID_HZ), np.float64)
         forces = self._forces(visit, random, time_s)
         lines: ComplexArray = np.zeros((len(frequency_hz), 3), dtype=np.complex128)
         for (natural_hz, damping, shape), force in zip(MODES, forces, strict=True):
@@ -290,7 +291,7 @@ class Hour:
     said: Sequence[str]
     value: Array
     u: Array
-    determined: Array
+    determined: NDArray[np.bool_]
     truth: Array
 
     @property

@@ -70,7 +70,8 @@ def one(job: Job) -> Outcome:
             used += isinstance(result, WindowReport) and result.used
     run.close()
     if first is None or update is None:
-        return Outcome(job, *(np.full(n, np.nan) for n in (12, 3, 3, 9, 3)), used, status == "HELD")
+        over_u, first_u, last_u, over_u_at_0hz, main = (np.full(n, np.nan) for n in (12, 3, 3, 9, 3))
+        return Outcome(job, over_u, first_u, last_u, over_u_at_0hz, main, used, status == "HELD")
     truth = building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9)
     size = building.size(update.reference_frequency_hz)
     S, true_S = np.array(update.sensitivity).ravel(), truth.sensitivity.ravel()

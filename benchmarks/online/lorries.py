@@ -95,7 +95,7 @@ class Roadside(Building):
             swell = age / LASTING * np.exp(1.0 - age / LASTING)
             moved += np.outer(PEAK_MPS2 * swell * np.sin(2.0 * np.pi * age), way / np.linalg.norm(way))
         if response is not None:
-            frequency_hz: Array = np.fft.rfftfreq(len(moved), 1.0 / rate_hz)
+            frequency_hz = np.asarray(np.fft.rfftfreq(len(moved), 1.0 / rate_hz), np.float64)
             moved = np.fft.irfft(response(frequency_hz)[:, None] * np.fft.rfft(moved, axis=0), len(moved), axis=0)
         return CubicSpline(time_s, moved)
 
@@ -168,7 +168,7 @@ def window(seed: int, kind: str = ".", calm_hz: tuple[float, float] = CALM_HZ) -
     time ("W"), or in three bumps of a second, four times as strong ("B"). The sensor has the filter, whose delay is
     taken out."""
     random, n = np.random.default_rng(seed), round(RATE_HZ * WINDOW_S)
-    frequency_hz: Array = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
+    frequency_hz = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
 
     def moved(band_hz: tuple[float, float], level_mps2: float) -> Array:
         lines = random.normal(size=(3, len(frequency_hz))) + 1j * random.normal(size=(3, len(frequency_hz)))
@@ -186,7 +186,9 @@ def window(seed: int, kind: str = ".", calm_hz: tuple[float, float] = CALM_HZ) -
     du = np.fft.irfft(lines * 2j * np.pi * frequency_hz, n)
     late = FILTER(frequency_hz) * np.exp(2j * np.pi * frequency_hz * DELAY_S)
     V = np.fft.irfft(S @ (lines * late), n) + 0.0005 * random.normal(size=u.shape)
-    bands = beside_noise(band_sums(u.T, du.T, V.T, RATE_HZ), np.full(3, np.inf))
+    in_bands = band_sums(u.T, du.T, V.T, RATE_HZ)
+    assert in_bands is not None
+    bands = beside_noise(in_bands, np.full(3, np.inf))
     edges = np.linspace(0, n, WINDOW_S + 1).astype(int)
     pose = Pose("beside", np.eye(3), np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2]))
     return Window(0.0, WINDOW_S, pose, window_sums(u.T, du.T, V.T, edges), True, "", n, 0, bands=bands)
@@ -194,7 +196,7 @@ def window(seed: int, kind: str = ".", calm_hz: tuple[float, float] = CALM_HZ) -
 
 def after(windows: Sequence[Window], band_hz: tuple[float, float] | None = None) -> State:
     """The state of a sensor after these windows, one an hour."""
-    still = replace(Wander.none(), offset_rate_mps2=1e-9)
+    still = Wander({**Wander.none().values, "offset_rate_mps2": 1e-9})
     state = State(MEAN, U, PRIORS, still, TemperatureModel(), fixed=True, band_hz=band_hz)
     for k, own in enumerate(windows):
         take(state, own, k)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Protocol
 
 from agent import __version__
 from agent.config import Config
-from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
+from agent.core.events import Acceleration, DeviceChange, Event, Output, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
 from agent.engine import identity
 from agent.recording.fingerprint import fingerprint, versions
@@ -69,7 +69,7 @@ class Run:
         if self._recorder is not None:
             self._recorder.close()
 
-    def _record(self, event: Event, results: list[Result]) -> None:
+    def _record(self, event: Event, results: Sequence[Output]) -> None:
         if self._recorder is not None and not self._recorder.record(self.events, event, results):
             raise OSError(self._recorder.fault)
 

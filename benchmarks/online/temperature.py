@@ -103,7 +103,7 @@ class Drawn:
         """A minute of tones."""
         t, random = np.arange(round(RATE_HZ * WINDOW_S)) / RATE_HZ, self.random
         a, da = np.zeros((len(t), 3)), np.zeros((len(t), 3))
-        for k, level in enumerate(np.exp(random.uniform(*np.log(LEVEL_MPS2), 3))):
+        for k, level in enumerate(np.exp(random.uniform(np.log(LEVEL_MPS2[0]), np.log(LEVEL_MPS2[1]), 3))):
             for hz in TONES_HZ:
                 angle = 2.0 * np.pi * hz * t + random.uniform(0.0, 2.0 * np.pi)
                 a[:, k] += level * np.sqrt(2.0 / len(TONES_HZ)) * np.sin(angle)

@@ -216,7 +216,8 @@ def slipping(seed: int) -> Told:
     name = ("theta_by_position_deg", "alpha_by_position_deg")[int(random.integers(2))]
     slipped = [*getattr(p.clamp, name)]
     slipped[0] += SLIP_DEG * random.choice([-1.0, 1.0])
-    after = Bench(replace(p, clamp=replace(p.clamp, **{name: tuple(slipped)})), seed)
+    at_stop: dict[str, Any] = {name: tuple(slipped)}
+    after = Bench(replace(p, clamp=replace(p.clamp, **at_stop)), seed)
     duration_s = schedule.duration_s(bench_day.ROUNDS) + bench_day.AFTER_S
     recording = world.recording(duration_s)
     slip_s = schedule.start_of(0) + random.uniform(0.3, 0.7) * bench_day.HOLD_S

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,8 +90,8 @@ class Adxl355Twin(FifoTwin):
     temperature_at_25_degc = 1885
     reset_s = 0.005
     shadow = bytes([0x4C, 0x21, 0x9A, 0x05, 0x33])  # factory trim; any constant will do
-    spi_modes = (0,)
-    spi_highest_hz = 10e6
+    spi_modes: ClassVar[tuple[int, ...]] = (0,)
+    spi_highest_hz: ClassVar[float] = 10e6
 
     def __init__(
         self,

@@ -86,7 +86,8 @@ def _run(directory: Path, *, heads: Sequence[GivenHead] = (), **options: Any) ->
     with runner.isolation() as (out, _, _):
         given = recordings_of([directory])
         given.heads.extend(heads)
-        status = run_audit(given, Engines(StandIn.restore), **{"strict": True, "keys": known(KEY)} | options)
+        stated: dict[str, Any] = {"strict": True, "keys": known(KEY)}
+        status = run_audit(given, Engines(StandIn.restore), **stated | options)
         return status, out.getvalue().decode()
 
 

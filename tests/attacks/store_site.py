@@ -119,7 +119,7 @@ class Run:
         """Give it events."""
         for event in events:
             outputs = self.pipeline.step(event)
-            self.results += outputs
+            self.results += [output for output in outputs if isinstance(output, Result)]
             self._record(event, outputs)
         return self
 

@@ -54,7 +54,17 @@ def test_the_agent_does_not_add_to_the_directory_of_another_gateway(tmp_path: Pa
     settings = tmp_path / "other.toml"
     settings.write_text(OTHER)
     before = sorted((path.name, path.stat().st_size) for path in (tmp_path / "a").iterdir())
-    command = [sys.executable, "-m", "agent", "run", settings, "--data-dir", tmp_path / "a", "--duration", "1"]
+    command: list[str | Path] = [
+        sys.executable,
+        "-m",
+        "agent",
+        "run",
+        settings,
+        "--data-dir",
+        tmp_path / "a",
+        "--duration",
+        "1",
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert "site/gateway" in done.stderr

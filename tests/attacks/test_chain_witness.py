@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -46,7 +47,7 @@ def audited(data: Path, kept: Path, tmp_path: Path) -> tuple[int, str]:
 @pytest.fixture(scope="module")
 def kept_site(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """(recordings, directory of a witness that saw all of their heads)."""
-    directory, heads = tmp_path_factory.mktemp("witness"), []
+    directory, heads = tmp_path_factory.mktemp("witness"), list[Any]()
     record(directory / "data", heads=heads)
     own = witness(directory / "kept")
     assert [own.take(GATEWAY, head)[0] for head in heads] == [True] * len(heads)
@@ -165,7 +166,18 @@ def test_a_head_reaches_the_witness_over_the_network(tmp_path: Path) -> None:
     publisher = Publisher("site", "gateway", [site.endpoint], store)
     kept = tmp_path / "kept"
     keys = listed(tmp_path / "known.keys", KEY, gateway=GATEWAY)
-    command = [sys.executable, "-m", "agent", "witness", "--dir", kept, "--connect", site.endpoint, "--keys", keys]
+    command: list[str | Path] = [
+        sys.executable,
+        "-m",
+        "agent",
+        "witness",
+        "--dir",
+        kept,
+        "--connect",
+        site.endpoint,
+        "--keys",
+        keys,
+    ]
     try:
         publisher.tell_head(head)
         publisher.start()

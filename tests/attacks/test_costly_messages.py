@@ -76,7 +76,7 @@ def test_a_thousand_messages_ahead_cost_a_gateway_a_query_a_second(site: Site) -
     with site.client() as gateway, Consumer([site.endpoint], last_sequence={"site/gw": 5}) as consumer:
         gateway.declare_queryable("fieldcal/v1/site/gw/**", answer)
         publisher = gateway.declare_publisher(PLACE)
-        wait_for(lambda: publisher.matching_status.matching)
+        wait_for(lambda: publisher.matching_status.matching)  # type: ignore[attr-defined]
         began_s = time.monotonic()
         for number in range(100, 1100):
             publisher.put(record(number, "calibration").payload, attachment=str(number - 1))

@@ -11,7 +11,8 @@ import msgspec
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import GivenFiles, audit_files, run_audit
+from agent.cli.audit import audit_files, run_audit
+from agent.cli.given import GivenFiles
 from agent.core.events import CalibrationUpdate, Output, Result, RunStart, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.engine import identity

@@ -172,10 +172,10 @@ def test_a_pose_that_lasts_for_ever_takes_no_time(start_s: float, stop_s: float)
     "text",
     [
         "5",
-        '{"gateway": {}}',
-        '{"channels": 5}',
-        '{"channels": [5]}',
-        '{"channels": [{"process": 5, "certificate": {}}]}',
+        pytest.param('{"gateway": {}}', marks=pytest.mark.thorough),
+        pytest.param('{"channels": 5}', marks=pytest.mark.thorough),
+        pytest.param('{"channels": [5]}', marks=pytest.mark.thorough),
+        pytest.param('{"channels": [{"process": 5, "certificate": {}}]}', marks=pytest.mark.thorough),
         '{"channels": [{"process": {"reference_pct": "a"}, "certificate": {"calibrated": 5}}]}',
     ],
 )

@@ -173,7 +173,7 @@ def resign(data: Path, _: Path) -> None:
     shutil.copy(other[1], data / "fieldcal-000002.mcap")
 
 
-TAMPERED: dict[str, tuple[Callable[[Path, Path], None], str]] = {
+TAMPERED: dict[str, tuple[Callable[[Path, Path], object], str]] = {
     "byte changed": (change_byte, r"000002.mcap: FAILED"),
     "result changed": (
         change_result,
@@ -188,19 +188,19 @@ TAMPERED: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "cut at the end": (lambda data, _: cut(data, 9), r"000002.mcap: FAILED: it does not begin and end as"),
     "empty": (lambda data, _: cut(data, 0.0), r"000002.mcap: FAILED: it is empty"),
     "other gateway's file": (
-        lambda data, other: shutil.copy(other / "fieldcal-000002.mcap", data) and None,
+        lambda data, other: shutil.copy(other / "fieldcal-000002.mcap", data),
         r"000002.mcap: FAILED: it is of site/other, the recording before it of site/gateway",
     ),
     "other gateway's head": (
-        lambda data, other: shutil.copy(other / "head.json", data) and None,
+        lambda data, other: shutil.copy(other / "head.json", data),
         r"head.json: FAILED: it is a head of site/other",
     ),
     "head of another directory": (
-        lambda data, other: shutil.copy(other.parent / "twin" / "head.json", data) and None,
+        lambda data, other: shutil.copy(other.parent / "twin" / "head.json", data),
         r"head.json: FAILED: (fieldcal-\d+.mcap does not begin with|it names recording)",
     ),
     "head changed": (
-        lambda data, _: (data / "head.json").write_text((data / "head.json").read_text().replace("yes", "no")) and None,
+        lambda data, _: (data / "head.json").write_text((data / "head.json").read_text().replace("yes", "no")),
         r"head.json: FAILED: its signature was not made with this key, or its text was changed",
     ),
 }

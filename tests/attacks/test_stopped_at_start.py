@@ -59,9 +59,9 @@ def slow(
     command: Sequence[str | Path], variables: Mapping[str, str] | None = None, **more: Any
 ) -> Iterator[subprocess.Popen[str]]:
     """A process that has just said "slow"."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(
-        [*map(str, command)], cwd=ROOT, env=os.environ | (variables or {}), text=True, **pipes, **more
+        [*map(str, command)], cwd=ROOT, env={**os.environ, **(variables or {})}, **pipes, **more
     ) as process:
         try:
             until_said(process, "slow")
@@ -106,7 +106,13 @@ def test_a_second_signal_does_not_cut_off_what_the_first_one_closes(tmp_path: Pa
         print("closing", flush=True)
         sys.stdin.readline()
         print("closed", flush=True)"""
-    command = [sys.executable, "-c", SLOW.replace("{what}", closing), tmp_path / "data", f"tcp/127.0.0.1:{free_port()}"]
+    command: list[str | Path] = [
+        sys.executable,
+        "-c",
+        SLOW.replace("{what}", closing),
+        tmp_path / "data",
+        f"tcp/127.0.0.1:{free_port()}",
+    ]
     with slow(command, stdin=subprocess.PIPE) as process:
         until_said(process, "open")
         process.send_signal(signal.SIGINT)

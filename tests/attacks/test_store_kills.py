@@ -87,7 +87,7 @@ def forge(path: Path, what: str) -> None:
     for topic, schema, *times, data in found.messages:
         number, item = decode(schema, data)
         if what == "data" and isinstance(item, SampleBlock):
-            data = encode(number, replace(item, indications=1.05 * item.indications))
+            data = encode(number, replace(item, indications=np.asarray(1.05 * item.indications)))
         elif what == "results" and isinstance(item, CalibrationUpdate):
             signature = data[-67:]
             sensitivity = (1.05 * np.array(item.sensitivity)).tolist()

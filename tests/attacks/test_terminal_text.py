@@ -104,7 +104,7 @@ def test_the_lines_of_a_run_are_lines(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_a_verdict_cannot_be_forged_by_a_line_break() -> None:
-    from agent.cli.audit import AuditedFile
+    from agent.audit.auditing import AuditedFile
 
     replayed = ReplayedFile(path="f", notes=[HOSTILE], refused=HOSTILE)
     verdict = AuditedFile(

@@ -26,7 +26,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if not isinstance(item, pytest.Function) or item.cls is None or not issubclass(item.cls, I2cContract):
             continue
         adapter = item.callspec.params["adapter"]
-        access = item.callspec.params["seed"] if "what_another_program" in item.name else 0
+        access = int(str(item.callspec.params["seed"])) if "what_another_program" in item.name else 0
         if adapter not in AT_ONCE or access >= ACCESSES_AT_ONCE:
             item.add_marker("slow")
         if item.cls.__name__ != ON_ALL and (adapter not in FOR_EACH_CHIP or access >= ACCESSES_FOR_EACH_CHIP):

@@ -64,7 +64,7 @@ class TestAdxl355(I2cContract):
         assert info.settings["RANGE"] == f"0x{registers[0x2C]:02X}" == "0x81"
         assert info.settings["POWER_CTL"] == f"0x{registers[0x2D]:02X}" == "0x00"
 
-    def test_wrong_identity(self, rig: Adxl355Rig) -> None:
+    def test_wrong_identity(self, rig: Adxl355Rig) -> None:  # type: ignore[override]
         adxl359 = Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, identity=b"\xad\x1d\xe9\x01")
         rig.put(adxl359)
         with pytest.raises(IdentityError, match=f"{rig.name}: expected the IDs ad 1d ed, found ad 1d e9"):
@@ -279,7 +279,7 @@ class TestAdxl359(TestAdxl357):
         yield rig
         rig.close()
 
-    def test_wrong_identity(self, rig: Adxl355Rig) -> None:
+    def test_wrong_identity(self, rig: Adxl355Rig) -> None:  # type: ignore[override]
         rig.put(Adxl357Twin(rig.counts, rig.due, lambda: rig.t_s))
         with pytest.raises(IdentityError, match=f"{rig.name}: expected the IDs ad 1d e9, found ad 1d ed"):
             rig.sensor.open()

@@ -75,7 +75,7 @@ class TestSeedlink(SensorContract):
         yield rig
         rig.close()
 
-    def test_polls_do_not_beat_with_the_sample_clock(self, rig: SeedLinkRig) -> None:
+    def test_polls_do_not_beat_with_the_sample_clock(self, rig: SeedLinkRig) -> None:  # type: ignore[override]
         """Replaced, because the station stamps its records and no poll can beat with the sample clock."""
         rig.open()
         for block in rig.blocks(2.0):

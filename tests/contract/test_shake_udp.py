@@ -126,14 +126,14 @@ class TestShakeUdp(SensorContract):
         yield rig
         rig.close()
 
-    def test_polls_do_not_beat_with_the_sample_clock(self, rig: ShakeRig) -> None:
+    def test_polls_do_not_beat_with_the_sample_clock(self, rig: ShakeRig) -> None:  # type: ignore[override]
         """Replaced, because the Shake stamps its datagrams and no poll can beat with the sample clock."""
         rig.open()
         for block in rig.blocks(2.0):
             last = rig.number(block.indications)[block.burst_count - 1]
             assert block.burst_t_monotonic_ns.tolist() == [k * PERIOD_NS for k in last.tolist()]
 
-    def test_what_came_before_the_loss_is_returned_first(self, rig: ShakeRig) -> None:
+    def test_what_came_before_the_loss_is_returned_first(self, rig: ShakeRig) -> None:  # type: ignore[override]
         """Replaced, because nothing but silence tells that a Shake is gone."""
         rig.open()
         *_, before = rig.blocks(0.6)

@@ -16,7 +16,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -118,7 +118,7 @@ def agent_after_valid(directory: Path, number: signal.Signals, endpoint: str, se
     for attempt in range(ATTEMPTS):
         place = directory / str(attempt)
         with rig(place, seed, endpoint=endpoint) as r, r.agent() as agent:
-            assert r.run(agent, VALID_S, until=lambda r=r: ": VALID" in r.output), r.output
+            assert r.run(agent, VALID_S, until=lambda r=r: ": VALID" in r.output), r.output  # type: ignore[misc]
             if ": VALID" in r.output:
                 ended = end(agent, number, place / "output")
                 return replace(ended, moment="after VALID", unfinished=len([*r.data_dir.glob("*.active")]))
@@ -200,12 +200,16 @@ def _others(place: Path, endpoint: str) -> dict[str, list[str | Path]]:
     }
 
 
+def counts(values: Iterable[object]) -> str:
+    """How often each value occurs."""
+    return ", ".join(f"{n} x {value}" for value, n in Counter(values).most_common())
+
+
 def table(found: Sequence[End]) -> str:
     """One row for each moment, router and signal."""
     rows = []
     for key in sorted({(one.moment, one.router, one.number) for one in found}):
         some = [one for one in found if (one.moment, one.router, one.number) == key]
-        counts = lambda values: ", ".join(f"{n} x {value}" for value, n in Counter(values).most_common())  # noqa: E731
         loads = [one.load for one in some]
         cells = (
             *key[:2], key[2].name, len(some), counts(one.status for one in some), sum(one.early for one in some),

@@ -13,7 +13,7 @@ import numpy as np
 
 from agent.audit.engines import Engines
 from agent.audit.replaying import Replayer
-from agent.core.events import CalibrationUpdate
+from agent.core.events import CalibrationUpdate, Result
 from agent.core.pipeline import Pipeline
 from agent.delivery.consumer import Received
 from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
@@ -182,7 +182,8 @@ def near_truth(update: CalibrationUpdate) -> bool:
 def _sequences(path: Path) -> Iterable[int]:
     for step in RecordingReader(path).steps():
         for result in step.results:
-            yield result.sequence
+            if isinstance(result, Result):
+                yield result.sequence
 
 
 def as_text(findings: Findings) -> str:

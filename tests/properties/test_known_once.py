@@ -132,7 +132,7 @@ class Life:
                     block[:, unknown] += weight * column
             whole.append(block)
         H, prior = np.vstack(whole), np.array(variance)
-        root = np.linalg.qr(np.vstack([np.eye(len(prior)), H * np.sqrt(prior)]), mode="r")
+        root = np.asarray(np.linalg.qr(np.vstack([np.eye(len(prior)), H * np.sqrt(prior)]), mode="r"))
         chosen = np.zeros((len(prior), 12))
         for k in range(12):
             chosen[list(parts[k]), k] = np.sqrt(prior[list(parts[k])])

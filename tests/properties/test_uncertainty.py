@@ -66,7 +66,7 @@ class World:
     now: Mapping[str, float]
     u: tuple[float, float]
     priors: Mapping[str, Any] = field(default_factory=dict)
-    walks: Mapping[str, float] = field(default_factory=dict)
+    walks: dict[str, float] = field(default_factory=dict)
     temperature: TemperatureModel = field(default_factory=TemperatureModel)
     until: float | None = None
     more: Mapping[str, object] = field(default_factory=dict)  # statements
@@ -266,7 +266,7 @@ def s_drifts_since_a_step(draw: Drawn) -> World:
 
 
 def correlated(size: int, seed: int) -> Array:
-    return np.linalg.cholesky(np.cov(np.random.default_rng(seed).normal(size=(size, 5 * size))))
+    return np.asarray(np.linalg.cholesky(np.cov(np.random.default_rng(seed).normal(size=(size, 5 * size)))), np.float64)
 
 
 def dated(draw: Drawn, held: Array | None) -> World:
@@ -706,6 +706,7 @@ def motion_along_an_axis_that_tells_nothing(draw: Drawn) -> World:
 SOME_AT_ONCE = [pytest.param(name, marks=pytest.mark.slow if k % 12 else ()) for k, name in enumerate(CASES)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME_AT_ONCE)
 def test_what_is_stated_is_what_the_error_is(name: str) -> None:
     world, draws = CASES[name], Drawn()

@@ -80,7 +80,8 @@ def test_the_response_in_a_band_is_that_of_the_spectra() -> None:
     sensor, reference, rate_hz = recorded()
     frequency_hz, h = ratio(sensor, reference, rate_hz)
     sections = butter(6, BAND_HZ, "bandpass", fs=rate_hz, output="sos")
-    found = calibrated(*(sosfiltfilt(sections, v - v.mean()) for v in (sensor, reference)), rate_hz)
+    filtered = [sosfiltfilt(sections, v - v.mean()) for v in (sensor, reference)]
+    found = calibrated(filtered[0], filtered[1], rate_hz)
     assert found.status == "valid"
     low_hz, high_hz = found.more["valid_band_hz"]
     assert high_hz / low_hz < 2.0  # S alone is right near its frequency only, and says so

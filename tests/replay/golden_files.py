@@ -88,11 +88,11 @@ def _events() -> Iterator[Event]:
     for device in streams:
         info = json.dumps(msgspec.to_builtins(golden_site.info(device)))
         yield DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=EPOCH_NS, info_json=info)
-    streams = [
+    blocks = [
         _blocks(golden_site.SENSOR, NoiseStream.SENSOR_ARRIVAL),
         _blocks(golden_site.REFERENCE, NoiseStream.REFERENCE_ARRIVAL),
     ]
-    yield from ticked(heapq.merge(*streams, key=lambda block: block.t_monotonic_ns))
+    yield from ticked(heapq.merge(*blocks, key=lambda block: block.t_monotonic_ns))
 
 
 def _blocks(device: str, stream: NoiseStream) -> Iterator[SampleBlock]:

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import GivenFiles, audit_files, recordings_of, run_audit
+from agent.cli.audit import audit_files, run_audit
+from agent.cli.given import GivenFiles, recordings_of
 from agent.core.events import RunStart
 from agent.recording.comparison import OTHER_CPU
 from agent.recording.files import recordings
@@ -160,7 +161,8 @@ AUDIT = """
 import sys
 from pathlib import Path
 from agent.audit.engines import Engines
-from agent.cli.audit import GivenFiles, run_audit
+from agent.cli.audit import run_audit
+from agent.cli.given import GivenFiles
 from agent.recording.fingerprint import compute_as
 from agent.recording.reading import first_event
 from tests.replay.stand_in import StandIn

@@ -12,7 +12,8 @@ from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from agent.audit.engines import Engines
-from agent.cli.audit import audit, audit_files, recordings_of, run_audit
+from agent.cli.audit import audit, audit_files, run_audit
+from agent.cli.given import recordings_of
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import KnownKeys
 from agent.delivery.store import Store

@@ -44,7 +44,8 @@ def two_runs(directory: Path, change: Callable[[Kept], Kept], engine: str = "", 
         last = max([last, *(result.sequence for result in results if isinstance(result, Result))])
 
     kept: Kept = {}
-    for run, of_run in enumerate((events, [e for e in events if isinstance(e, DeviceChange)]), start=1):
+    of_runs: tuple[list[Event], ...] = (events, [e for e in events if isinstance(e, DeviceChange)])
+    for run, of_run in enumerate(of_runs, start=1):
         pipeline = Pipeline.begin(config, f"run-{run}", 0, last + (unrecorded if kept else 0), kept)
         number = 0
         start = msgspec.structs.replace(

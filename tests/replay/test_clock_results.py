@@ -8,7 +8,8 @@ import msgspec
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import GivenFiles, run_audit
+from agent.cli.audit import run_audit
+from agent.cli.given import GivenFiles
 from agent.core.events import ClockReport, Result, RunStart, Tick
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import FILE_NAME, History

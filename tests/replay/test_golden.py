@@ -91,8 +91,8 @@ def test_an_earlier_engine_gives_the_results_that_it_recorded(directory: Path) -
     for (schema, data), (name, held) in zip(found, recorded, strict=True):
         assert schema == name
         if not is_event(schema):
-            pair = (msgspec.to_builtins(decode(schema, one)[1]) for one in (held, data))
-            assert list(differences(*pair, ELSEWHERE)) == []
+            expected, result = (msgspec.to_builtins(decode(schema, one)[1]) for one in (held, data))
+            assert list(differences(expected, result, ELSEWHERE)) == []
 
 
 @pytest.mark.parametrize("directory", FORMATS, ids=lambda path: path.name)

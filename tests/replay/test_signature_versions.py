@@ -8,7 +8,8 @@ import pytest
 from click.testing import CliRunner
 
 from agent.audit.engines import Engines
-from agent.cli.audit import recordings_of, run_audit
+from agent.cli.audit import run_audit
+from agent.cli.given import recordings_of
 from agent.config.known_keys import KnownKeys
 from agent.recording.signing import load_public_key
 from tests.replay.forgery import with_sums

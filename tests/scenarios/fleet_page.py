@@ -101,7 +101,8 @@ class CommandedGateway:
         def serve(session: zenoh.Session, opened: ExitStack) -> None:
             serve_queries(session, place, self.desk.desk, opened)
 
-        self._publisher = Publisher(*GATEWAY.split("/"), [site.endpoint], self._store, serve=serve)
+        name, gateway = GATEWAY.split("/")
+        self._publisher = Publisher(name, gateway, [site.endpoint], self._store, serve=serve)
         self._publisher.start()
 
     def publish_more(self) -> int:
@@ -109,7 +110,8 @@ class CommandedGateway:
         first = self._store.last_sequence() + 1
         estimate = Estimate(run_id="r", sequence=first + 1, sensor="mems", t_utc_ns=time.time_ns(),
                             reason="Sxx changed by 4 U", calibration=calibration(first + 1))  # fmt: skip
-        known = {"response": RESPONSE, "reference_frequency_hz": 5.0, "reference_temperature_degc": 21.0,
+        known: dict[str, Any] = {
+                 "response": RESPONSE, "reference_frequency_hz": 5.0, "reference_temperature_degc": 21.0,
                  "temperature_low_degc": 15.0, "temperature_high_degc": 30.0, "references": ["B12 4711"]}  # fmt: skip
         self.publish([record(first, "calibration", **known),
                       StoredResult.of(estimate, recorded=True, recording="f.mcap", epoch=""),
@@ -244,7 +246,7 @@ def with_few_colours(picture: Image.Image) -> Image.Image:
     from PIL import Image
 
     counts = sorted(picture.getcolors(picture.width * picture.height) or (), reverse=True)
-    frequent = [part for _, colour in counts[:COLOURS] for part in colour]  # type: ignore[union-attr]
+    frequent = [part for _, colour in counts[:COLOURS] for part in colour]  # type: ignore[attr-defined, union-attr]
     between = picture.quantize(COLOURS, dither=Image.Dither.NONE).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*frequent, *between[: 3 * COLOURS]])
@@ -297,4 +299,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--views", type=Path, metavar="DIR", help="pictures of all views, and what axe-core finds")
     args = parser.parse_args()
-    sys.exit(write_pictures() if args.views is None else look_at_views(args.views) > 0)
+    if args.views is not None:
+        sys.exit(look_at_views(args.views) > 0)
+    write_pictures()

@@ -14,7 +14,8 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.commanding.local import LocalAgent
-from agent.delivery.store import UNKEPT_MAX, Store
+from agent.delivery.store import Store
+from agent.recording.continuation import UNKEPT_MAX
 from hw.virtual.serial_port import PtyDevice
 from tests.replay.test_audit_chain import write_keys
 from tests.scenarios.processes import interrupt, recordings, results, started, wait_until

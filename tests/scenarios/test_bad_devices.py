@@ -183,7 +183,10 @@ FAULTS = [
 def test_a_faulty_configuration_is_refused_with_path_and_value(tmp_path: Path, old: str, new: str, named: str) -> None:
     path = configuration(tmp_path, Path("/dev/ttyUSB0"))
     path.write_text(path.read_text().replace(old, new))
-    for command in (["check", path], ["run", path, "--data-dir", tmp_path / "data", "--duration", "5"]):
+    commands: tuple[list[str | Path], ...] = (
+        ["check", path], ["run", path, "--data-dir", tmp_path / "data", "--duration", "5"],
+    )  # fmt: skip
+    for command in commands:
         done = fieldcal(*command)
         assert done.returncode == 2, done.stdout
         assert str(path) in done.stderr

@@ -57,7 +57,10 @@ def test_reads_that_beat_with_the_samples_cost_no_window(seed: int) -> None:
     All 12 parameters must be within 4 u.
     """
     p = bench.world(seed, 200.0).parameters
-    sensor, reference = (replace(part, bursts=replace(part.bursts, apart_s=0.0)) for part in (p.sensor, p.reference))
+    assert p.sensor.bursts is not None
+    assert p.reference.bursts is not None
+    sensor = replace(p.sensor, bursts=replace(p.sensor.bursts, apart_s=0.0))
+    reference = replace(p.reference, bursts=replace(p.reference.bursts, apart_s=0.0))
     world = Bench(replace(p, sensor=sensor, reference=reference), seed)
     duration_s = world.parameters.schedule.duration_s(bench.ROUNDS) + bench.AFTER_S
     update, reports = bench.online(world, duration_s)

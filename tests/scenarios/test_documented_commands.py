@@ -15,6 +15,7 @@ import pytest
 from tests.scenarios.processes import ROOT, interrupt, started, wait_until
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FIRST = ("README.md", "start.md", "calibrate.md", "recording.md")  # in `make test`; the other pages in `make test-all`
 FENCE = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # Commands that run until they are stopped, each with a text in its first output.
 ENDLESS = {"run": "recording", "router": "tcp/", "simulate": "sensor "}
@@ -37,7 +38,9 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, marks=[] if p.name in FIRST else pytest.mark.thorough, id=p.name) for p in PAGES]
+)
 def test_documented_commands_run(page: Path, tmp_path: Path, data_dir: Path) -> None:
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     for directory in (data_dir, data_dir.with_name("keys")):

@@ -188,13 +188,14 @@ def test_each_kind_of_sensor_says_what_it_is_and_whether_its_values_may_be_used(
         )
         assert [kind for kind, _, _ in cards] == [kind for kind, _, _ in SAID]
         # A date is that of an invented calibration, of 60 each fifth day until today.
-        days = {str(k): page.evaluate(DAY, k) for k in (39, 40, 47, 49, 50)}
+        days: dict[str | Any, Any] = {str(k): page.evaluate(DAY, k) for k in (39, 40, 47, 49, 50)}
         for (_, usable, say), (kind, wanted, part) in zip(cards, SAID, strict=True):
             assert re.match(re.sub(r"\{(\d+)\}", lambda k: days[k[1]], wanted), usable), (kind, usable)
             assert re.search(re.sub(r"\{(\d+)\}", lambda k: days[k[1]], part), say), (kind, say)
         for commands, wanted_run in zip(page.locator("#cards .card").evaluate_all(RUN_OF), RUN, strict=True):
             assert len(commands) == (wanted_run is not None)
             for where, command in commands:
+                assert wanted_run is not None
                 assert (where[-len(wanted_run[0]) :], command) == wanted_run
                 program, *words = command.split()
                 assert program != "fieldcal" or list(unknown(words)) == []

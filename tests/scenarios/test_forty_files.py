@@ -49,7 +49,9 @@ def test_there_are_forty() -> None:
 
 
 @pytest.mark.filterwarnings("default")  # the libraries' own
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize(  # `make test` has each fourth
+    "name", [pytest.param(name, marks=pytest.mark.thorough if k % 4 else ()) for k, name in enumerate(WRITERS)]
+)
 def test_the_same_s_and_q(
     name: str, expected: dict[bool, dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

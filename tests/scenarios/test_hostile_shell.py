@@ -41,7 +41,7 @@ def filled(data_dir: Path) -> Path:
 
 
 def test_an_output_that_takes_nothing_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "agent", "show", "--data-dir", filled(tmp_path)]
+    command: list[str | Path] = [sys.executable, "-m", "agent", "show", "--data-dir", filled(tmp_path)]
     with open("/dev/full", "w") as full:
         told = subprocess.run(
             command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, timeout=20, check=False
@@ -50,7 +50,7 @@ def test_an_output_that_takes_nothing_is_one_line(tmp_path: Path) -> None:
 
 
 def test_an_output_without_unicode_gets_what_it_can_take(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "agent", "show", "--data-dir", filled(tmp_path)]
+    command: list[str | Path] = [sys.executable, "-m", "agent", "show", "--data-dir", filled(tmp_path)]
     ascii_only = os.environ | {"PYTHONIOENCODING": "ascii"}
     told = subprocess.run(command, cwd=ROOT, env=ascii_only, capture_output=True, text=True, timeout=20, check=False)
     assert told.returncode == 0, told.stderr

@@ -6,6 +6,8 @@ import itertools
 import sys
 from typing import Any
 
+import pytest
+
 from agent.core.events import WindowReport
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import Run, visits
@@ -15,6 +17,7 @@ EARLY, LATE = range(60, 70), range(150, 160)  # of one day; the newest 48 window
 LARGEST = 1_500_000  # bytes of a state with a record an hour for two weeks, of which 170 are here
 
 
+@pytest.mark.thorough
 def test_work_and_state_are_flat() -> None:
     """Python function calls for each window, and bytes of the snapshot. Unlike time, they do not depend on load."""
     drawn = node(2, all_axes=True, timing=Timing(10.0, 3600.0, WINDOWS))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agent.config import parse_config
-from agent.core.events import CalibrationUpdate, DeviceChange, Result
+from agent.core.events import CalibrationUpdate, DeviceChange, Output
 from agent.core.pipeline import Pipeline
 from hw.sensor import Sensor
 from hw.virtual.device import ROTATION, Virtual, VirtualOptions
@@ -53,7 +53,7 @@ def calibrated(reference: str, **channel: Any) -> CalibrationUpdate:
         "channels": [{"sensor": "sensor", "reference": "reference", "prior": {}} | channel],
     }
     pipeline = Pipeline.begin(parse_config(config, "test"), "run", 0, 0, {})
-    results: list[Result] = []
+    results: list[Output] = []
     for role, device in devices.items():
         results += pipeline.step(opened(role, device, machines[role]))
     while machines["sensor"].t_s < SECONDS:

@@ -87,7 +87,8 @@ def test_each_puts_only_what_is_theirs(site: SecuredSite) -> None:
         )
         got: list[bytes] = []
         subscriber = listener.declare_subscriber(
-            "fieldcal/v1/**", zenoh.handlers.Callback(lambda s: got.append(s.payload.to_bytes()), indirect=False)
+            "fieldcal/v1/**",
+            zenoh.handlers.Callback(lambda s: got.append(s.payload.to_bytes()), indirect=False),  # type: ignore[arg-type]
         )
 
         def arrives(session: zenoh.Session, key: str, payload: bytes) -> bool:

@@ -91,7 +91,7 @@ def imu(tmp_path: Path) -> Iterator[PtyDevice]:
 def agent(tmp_path: Path, imu: PtyDevice, site: Site, systemd: Systemd) -> Iterator[subprocess.Popen[bytes]]:
     config = tmp_path / "gateway.toml"
     config.write_text(CONFIG.format(port=imu.path, endpoint=site.endpoint))
-    command = [sys.executable, "-m", "agent", "run", config, "--data-dir", tmp_path / "data"]
+    command: list[str | Path] = [sys.executable, "-m", "agent", "run", config, "--data-dir", tmp_path / "data"]
     with open(tmp_path / "log", "wb") as log:
         there = os.fstat(log.fileno())
         environment = os.environ | systemd.environment | {"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"}

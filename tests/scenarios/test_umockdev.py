@@ -151,6 +151,7 @@ def test_check_and_doctor_ask_the_devices(tmp_path: Path, site: UmockdevSite, bu
     assert "the adapter can neither do plain I2C transfers nor read an I2C block over SMBus" in out
 
 
+@pytest.mark.thorough
 def test_who_uses_a_device_is_told(tmp_path: Path, site: UmockdevSite, port: PtyDevice) -> None:
     data_dir = tmp_path / "data"
     config = configuration(tmp_path, port)
@@ -226,6 +227,7 @@ def lost(data_dir: Path) -> set[str]:
     return {name for name, state in last.items() if state == "lost"}
 
 
+@pytest.mark.thorough
 def test_the_same_chips_over_spi(tmp_path: Path) -> None:
     chips = {name: (twin, rate_hz) for name, (twin, _, rate_hz) in DEVICES.items() if twin.spi_modes}
     buses = {

@@ -162,9 +162,9 @@ class Recording:
             np.savetxt(directory / f"{name}.csv", rows, "%.9f", ",", header=header, comments="")
         told = ["--sensor", str(directory / "sensor.csv"), "--reference", str(directory / "reference.csv")]
         if self.bench:
-            rows = [[k * self.stand_s, (k + 1) * self.stand_s, THETA_DEG, a] for k, a in enumerate(ALPHAS_DEG)]
+            stands = [[k * self.stand_s, (k + 1) * self.stand_s, THETA_DEG, a] for k, a in enumerate(ALPHAS_DEG)]
             np.savetxt(
-                directory / "poses.csv", rows, "%g", ",", header="start_s,stop_s,theta_deg,alpha_deg", comments=""
+                directory / "poses.csv", stands, "%g", ",", header="start_s,stop_s,theta_deg,alpha_deg", comments=""
             )
             told += ["--poses", str(directory / "poses.csv")]
         told += ["--coupling", "ac" if self.devices.sensor_corner_hz else "dc", "--json", "-", *options]

@@ -54,7 +54,7 @@ def main() -> None:
     import scipy.signal
 
     del asyncio, subprocess, tempfile, scipy
-    builtins.__import__ = _refusing
+    builtins.__import__ = _refusing  # type: ignore[assignment]
     for module, names in FUNCTIONS:
         for name in names:
             if hasattr(module, name):

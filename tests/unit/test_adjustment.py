@@ -13,7 +13,7 @@ from calib.model import Pose
 from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE, TRUTH, Faults, clamp_points, window_of
 
 DEGREE = np.deg2rad(1.0)
-FREE_LAG = replace(Priors.none(), lag_s=0.02)
+FREE_LAG = Priors.none().with_values({"lag_s": 0.02})
 UNKNOWN = np.full(3, np.nan)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -18,7 +16,7 @@ from tests.clamp_windows import ALPHAS_DEG, G_MPS2, S_TRUE, TRUTH, frame, window
 
 RATE_HZ, SECONDS, CORNER_HZ = 200.0, 20.0, 0.16
 LINES_HZ = np.array([0.5, 1.3, 2.9, 6.1])
-PRIORS = replace(Priors.none(), lag_s=0.02, reference_corner_hz=0.05, offset_mps2=0.05)
+PRIORS = Priors.none().with_values({"lag_s": 0.02, "reference_corner_hz": 0.05, "offset_mps2": 0.05})
 
 
 def _motion(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

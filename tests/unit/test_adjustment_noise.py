@@ -14,7 +14,7 @@ from tests.clamp_windows import S_TRUE, Faults, clamp_points, window_of
 
 RATE_HZ, SECONDS, STRETCH_S = 100.0, 300.0, 10.0
 BESIDE = Pose("beside", np.eye(3), np.full(3, np.nan))
-FREE_LAG = replace(Priors.none(), lag_s=0.02)
+FREE_LAG = Priors.none().with_values({"lag_s": 0.02})
 
 
 def _band(random: np.random.Generator, rms: float) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -130,7 +131,7 @@ def plug_in(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     """The run in which the agent met each bug, with TOGETHER - 1 other ones."""
-    found = {}
+    found = dict[str, Any]()
     for begin in range(0, len(BUGS), TOGETHER):
         bugs = BUGS[begin : begin + TOGETHER]
 

@@ -179,6 +179,7 @@ def plain_method_3(bench: Bench) -> tuple[np.ndarray, np.ndarray]:
     return solution[:3].T, solution[3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_plain_method_3_finds_the_truth_of_the_plain_bench_and_misses_it_on_the_faulty_one(seed) -> None:
     for bench, least, most in ((Bench(plain(seed), seed), 0.0, 5e-4), (Bench(faulty(seed), seed), 5e-3, 5e-2)):

@@ -218,6 +218,7 @@ def test_transverse_motion_is_felt_across_and_not_seen_by_a_uniaxial_reference()
     assert_allclose(moved.sensor_values(0, 500) - plain.sensor_values(0, 500), expected, atol=STILL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feels_gravity", [True, False])
 def test_triaxial_reference_beside_the_sensor(feels_gravity) -> None:
     turn = radians(20)

@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def test_files_hold_the_recording_and_its_truth(preset, tmp_path, capsys) -> Non
     files = " ".join(f"--{name} {directory}/{name}.csv" for name in ("sensor", "reference", "poses"))
     assert capsys.readouterr().out == f"fieldcal calibrate {files} --nominal 26104.7 --u-nominal-pct 20\n"
     recording = Bench(PRESETS[preset](3), 3).recording(30.0)
-    half_microsecond = {"rtol": 0, "atol": 0.5001e-6}
+    half_microsecond: dict[str, Any] = {"rtol": 0, "atol": 0.5001e-6}
     sensor = np.loadtxt(directory / "sensor.csv", delimiter=",", skiprows=1)
     assert (directory / "sensor.csv").read_text().startswith("time_s,vx,vy,vz,temperature_degc\n")
     assert_allclose(sensor[:, 0], recording.sensor_stamp_s, **half_microsecond)
@@ -212,6 +213,7 @@ def _waiting(port: int) -> int:
     return int.from_bytes(fcntl.ioctl(port, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
+@pytest.mark.slow
 def test_a_bench_serves_both_devices_from_one_zero_until_interrupted(tmp_path) -> None:
     with running("--preset", "plain", "--seed", "4", "--link", str(tmp_path / "bench")) as process:
         assert process.stdout is not None

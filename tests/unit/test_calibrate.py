@@ -101,7 +101,7 @@ def test_a_velocity_reference_is_differentiated(tmp_path: Path, capsys: pytest.C
 
 def test_a_tri_axial_reference_needs_no_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     p = plain(7)
-    directions = [directed(d, g, 8.0) for d in np.eye(3) for g in ([0.0, 0.0, 9.80665], [0.0, -9.80665, 0.0])]
+    directions = [directed(d, np.array(g), 8.0) for d in np.eye(3) for g in ([0.0, 0.0, 9.80665], [0.0, -9.80665, 0.0])]
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     bench = files(
         tmp_path,
@@ -134,7 +134,8 @@ def test_directions_without_gravity_leave_the_offset_open(
 
 def test_one_axis_gives_one_column(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     p = plain(7)
-    bench = files(tmp_path, replace(p, schedule=Schedule((directed([1, 0, 0], [0, 0, 9.8], 8.0),), 1.0, 1.0)))
+    still = directed(np.array([1, 0, 0]), np.array([0, 0, 9.8]), 8.0)
+    bench = files(tmp_path, replace(p, schedule=Schedule((still,), 1.0, 1.0)))
     (tmp_path / "poses.csv").write_text("start_s,stop_s,axis\n1,9,x\n")
     status, found, _ = run(capsys, *arguments(tmp_path))
     assert status == 0

@@ -71,6 +71,7 @@ def test_the_numbers_survive_json_and_xml(made: Path) -> None:
         np.testing.assert_allclose(covariance, told["covariance"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_dcc_holds_what_the_result_holds(made: Path) -> None:
     """Read by its own names: units in D-SI, U, k, the response, the reference's certificate by its hash."""
     told, root = uneven(), ET.parse(made / "certificate.xml").getroot()

@@ -45,7 +45,9 @@ def site(tmp_path: Path) -> Path:
             for i, (n, k) in enumerate(zip(names, keys, strict=True))]  # fmt: skip
     (tmp_path / "authority.pem").write_bytes(made[0].public_bytes(Encoding.PEM))
     (tmp_path / "chain.pem").write_bytes(made[2].public_bytes(Encoding.PEM) + made[1].public_bytes(Encoding.PEM))
-    for name, key in {"key.pem": keys[2], "ed25519.pem": ed25519.Ed25519PrivateKey.generate()}.items():
+    own: dict[str, ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey]
+    own = {"key.pem": keys[2], "ed25519.pem": ed25519.Ed25519PrivateKey.generate()}
+    for name, key in own.items():
         (tmp_path / name).write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
         (tmp_path / name).chmod(0o600)
     return tmp_path

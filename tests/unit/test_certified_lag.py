@@ -22,7 +22,9 @@ def test_a_reference_that_is_late_as_certified_calibrates() -> None:
     # The sensor's indications come before those of the reference.
     assert [report.numbers["lag_applied_s"] for report in reports] == pytest.approx([-LATE_S] * len(reports), abs=2e-4)
     in_force = updates(found)[-1]
-    lag_s, u_lag_s = site.pipeline._channels[0]._estimation.state.quantity("lag")
+    estimation = site.pipeline._channels[0]._estimation
+    assert estimation is not None
+    lag_s, u_lag_s = estimation.state.quantity("lag")
     assert abs(lag_s + LATE_S) < 3.0 * u_lag_s <= 3.0 * np.hypot(1e-4, 1e-4)
     assert in_force.windows >= 6
 

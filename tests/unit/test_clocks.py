@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from agent.core.snapshot import pack, unpack
 from agent.core.stream import DeviceStream
 from agent.delivery.history import StoredResult
 from calib.distributions import chi2_quantile
-from hw.block import SampleBlock
+from hw.block import BlockFlags, SampleBlock
 from tests.unit.test_pipeline import EPOCH_NS, SECOND, felt, lost, motion, opened, pipeline, tick
 
 BLOCK_S = 0.5
@@ -49,7 +50,7 @@ def in_order(*devices: list[SampleBlock]) -> list[Event]:
     return [opened("s", 0.0), opened("r", 0.0, axes=1), *sent]
 
 
-def clocks(found: Pipeline, events: list[Event]) -> list[ClockReport]:
+def clocks(found: Pipeline, events: Iterable[Event]) -> list[ClockReport]:
     return [r for event in events for r in found.step(event) if isinstance(r, ClockReport)]
 
 
@@ -97,7 +98,7 @@ def test_the_lag_is_that_of_the_sensor_behind_the_reference(lag_s: float) -> Non
 
 def test_a_lag_that_no_window_told_is_unknown() -> None:
     late_s = np.zeros(6500)
-    alone = [opened("s", 0.0), *blocks("s", 101.3, 100.0, 62.0, late_s)]
+    alone: list[Event] = [opened("s", 0.0), *blocks("s", 101.3, 100.0, 62.0, late_s)]
     silent = in_order(blocks("s", 101.3, 100.0, 62.0, late_s), [])
     for found, events in ((pipeline(reference=False, rate_hz=100.0), alone), (pipeline(True, 100.0), silent)):
         [report] = clocks(found, list(events))
@@ -124,7 +125,7 @@ def test_minutes_in_which_nothing_happens_are_not_made_up_for() -> None:
 def test_a_device_in_place_of_another_is_not_reported_by_the_clock_before() -> None:
     found = pipeline(reference=True, rate_hz=100.0)
     clocks(found, both(59.0))
-    swapped = [lost("r", 59.5), opened("r", 59.6, axes=1, serial_number="other"), tick(61.0)]
+    swapped: list[Event] = [lost("r", 59.5), opened("r", 59.6, axes=1, serial_number="other"), tick(61.0)]
     assert [r.device for r in clocks(found, list(swapped))] == ["s"]
 
 
@@ -167,3 +168,16 @@ def test_numbers_that_are_unknown_are_null_in_json() -> None:
     [report] = clocks(pipeline(reference=True, rate_hz=100.0), events)
     fields = json.loads(StoredResult.of(report, recorded=True, recording="f").payload)
     assert (fields["lag_s"], fields["u_lag_s"], fields["device"], fields["role"]) == (None, None, "s", "sensor")
+
+
+def test_a_break_is_from_the_end_of_the_last_sample_to_the_first_one_after_it() -> None:
+    stream, rate_hz, n = DeviceStream("s", 0), 100.0, 50
+    for begins_s, flags in ((1.0, BlockFlags.RESTART), (1.5, BlockFlags.NONE), (4.0, BlockFlags.RESTART)):
+        first = round(begins_s * rate_hz)
+        count = np.arange(10, n + 1, 10, dtype=np.int32)
+        arrivals = np.round((first + count) / rate_hz * SECOND).astype(np.int64)
+        stream.update(SampleBlock("s", "boot", 0, first, rate_hz, arrivals, count, np.zeros((n, 3)), flags=flags))
+    [(ended_s, began_s)] = stream.breaks(0.0, 10.0)
+    assert (ended_s, began_s) == pytest.approx((2.0, 4.0), abs=0.02)
+    stream.forget_before(3.0)
+    assert stream.breaks(0.0, 10.0) == []

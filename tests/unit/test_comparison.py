@@ -63,6 +63,7 @@ def test_one_bit_is_a_difference_and_its_place_is_told(results: list[Result]) ->
     ("a", "b", "exact", "close"),
     [
         (NAN, NAN, True, True),
+        (NAN, -NAN, False, True),
         (NAN, 1.0, False, False),
         (0.0, -0.0, False, True),
         (1.0, 1.0 + 0.5e-9, False, True),

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from agent.config import ConfigError, load_config, parse_config
-from agent.config.reading import LARGEST_FILE, SHOWN_FAULTS
+from agent.config.faults import SHOWN_FAULTS
+from agent.config.reading import LARGEST_FILE, refused
 from agent.config.size import LONGEST_LIST
 
 DEVICES = """
@@ -123,6 +124,7 @@ def test_a_file_that_is_none_is_a_fault(tmp_path: Path, content: bytes | None) -
     assert all(line.startswith(f"{path}: ") for line in caught.value.faults)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -153,6 +155,12 @@ def test_a_hostile_file_is_refused_soon_and_in_few_words(tmp_path: Path, text: s
     assert time.process_time() - began_s < 5.0
     assert len(caught.value.faults) <= SHOWN_FAULTS + 1
     assert max(len(fault) for fault in caught.value.faults) < len(str(path)) + 400
+
+
+def test_faults_that_are_not_shown_are_counted() -> None:
+    fault = (("a",), "wrong")
+    assert refused([fault] * SHOWN_FAULTS, "f", "").faults == ["f: a: wrong"] * SHOWN_FAULTS
+    assert refused([fault] * (SHOWN_FAULTS + 1), "f", "").faults[SHOWN_FAULTS:] == ["f: and 1 more faults, not shown"]
 
 
 def test_files_of_tls_are_checked_with_the_rest(tmp_path: Path) -> None:

@@ -46,6 +46,7 @@ def test_the_prior_is_what_the_file_states_and_a_recording_carries_it(made: Path
     assert recorded_config(config.model_dump_json()) == config
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["certificate.xml", "certificate.json"])
 def test_the_reference_has_the_mean_main_sensitivity_its_number_and_its_date(
     made: Path, tmp_path: Path, name: str

@@ -102,7 +102,7 @@ def test_tokens_of_gateways_that_do_not_exist_take_bounded_memory(site: Site, mo
         found: list[str] = []
         for _ in range(5):  # each time they come anew
             tokens = [stranger.liveliness().declare_token(f"fieldcal/v1/s/gw{k}/alive") for k in range(30)]
-            wait_for(lambda: bool(found.extend(watched.due(100)) or found))
+            wait_for(lambda: bool(found.extend(watched.due(100)) or found))  # type: ignore[func-returns-value]
             for token in tokens:
                 token.undeclare()
         assert len(watched._look_s) <= 10

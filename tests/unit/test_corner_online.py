@@ -26,7 +26,7 @@ GAPS = tuple(k for first in (1500, 4700, 9100, 15300) for k in range(first, firs
 
 def drawn(seed: int, of: str, **more: Any) -> Devices:
     corner_hz = CORNER_HZ + U_CORNER_HZ * np.random.default_rng([seed, 3]).normal()
-    return replace(Devices(**more), **{f"{of}_corner_hz": float(corner_hz)})
+    return Devices(**more | {f"{of}_corner_hz": float(corner_hz)})
 
 
 def errors(recording: Recording, **sections: Any) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from agent.config import Config
-from agent.core.events import WindowReport
+from agent.core.events import Event, WindowReport
 from agent.core.pipeline import Pipeline
 from hw.block import BlockFlags, SampleBlock
 from tests.unit.mounted_site import begun, said, site_config
@@ -98,7 +98,7 @@ def test_a_device_that_starts_anew_all_the_time_is_one_refused_window() -> None:
 @pytest.mark.slow
 def test_the_state_between_two_runs_of_samples_is_in_the_snapshot() -> None:
     for config in (told(), found()):
-        events = [opened(), *holed(blocks(stay()), BlockFlags.RESTART)]
+        events: list[Event] = [opened(), *holed(blocks(stay()), BlockFlags.RESTART)]
         going_on, restored = (Pipeline.begin(config, "run", 0, 0, {}) for _ in range(2))
         for event in events:
             restored = Pipeline.restore(config.model_dump_json(), restored.snapshot())
@@ -125,7 +125,7 @@ def test_beside_a_tri_axial_reference_too(device: str, flags: BlockFlags) -> Non
                 event = replace(event, flags=flags)
         return original(event)
 
-    site.step = step  # type: ignore[method-assign] - the way of the blocks, not what is tested
+    site.step = step  # type: ignore[method-assign]  # the way of the blocks, not what is tested
     site.play(6)
     of = "" if device == "s" else "reference_"
     windows = of_site(site.results)

@@ -77,6 +77,7 @@ def asked(*words: str | Path) -> str:
     return subprocess.run(["dpkg-deb", *words], capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.slow
 def test_what_it_depends_on(package: Path) -> None:
     fields = dict(line.split(": ", 1) for line in asked("-f", package).splitlines() if line[:1] != " ")
     minor = subprocess.run(
@@ -87,6 +88,7 @@ def test_what_it_depends_on(package: Path) -> None:
     assert int(fields["Installed-Size"]) > 1000
 
 
+@pytest.mark.slow
 def test_what_is_in_it(package: Path, tmp_path: Path) -> None:
     asked("-x", package, tmp_path)
     for place, source in {

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.unit.drawn_recording import Devices, Recording, in_force, reports
 
-DISPLACEMENT = {"certificate": {"quantity": "displacement"}}
+DISPLACEMENT: dict[str, Any] = {"certificate": {"quantity": "displacement"}}
 LASER = Devices(rate_hz=200.0, reference_rate_hz=50.0, derivatives=2, reference_noise=1e-6)
 GNSS = Devices(reference_rate_hz=10.0, derivatives=2, reference_noise=1e-3, band_hz=(0.3, 0.9), level_mps2=0.5)
 CASES = {

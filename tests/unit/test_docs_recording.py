@@ -86,6 +86,7 @@ def off_by(code: str, monkeypatch: pytest.MonkeyPatch, directory: Path) -> float
     return float(np.max(np.abs(names["S"].ravel() - published) / u))
 
 
+@pytest.mark.slow
 def test_s_by_plain_least_squares_is_the_published_one(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

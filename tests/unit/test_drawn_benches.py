@@ -90,7 +90,8 @@ def beyond(seed: int) -> float | None:
     return float(np.abs(errors / found.standard_uncertainty.ravel())[found.determined.ravel()].max())
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(k, marks=pytest.mark.thorough) for k in range(4, 8))])
 def test_a_drawn_bench_is_within_4_u(seed: int) -> None:
     largest = beyond(seed)
     assert largest is not None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +20,16 @@ MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
 SYY, QX = 4, 9
 RATE = 3e-4  # of S_yy a day: 11 % a year
-EXACT = {"level_mps2": (0.0, 0.5, 0.0), "noise_mps2": 0.001}
+EXACT: dict[str, Any] = {"level_mps2": (0.0, 0.5, 0.0), "noise_mps2": 0.001}
 PRIORS = Priors(reference=1e-3, offset_mps2=1e-3, lag_window_s=0.0)
 
 
 def told_of_a_drift(days: range, u_rate: np.ndarray) -> State:
     """Ten windows without drift, then the drift is told and a window comes each of `days`."""
     random = np.random.default_rng(1)
-    found = State(MEAN, U, PRIORS, replace(Wander.none(), offset_rate_mps2=1e-9), TemperatureModel(), fixed=True)
+    found = State(
+        MEAN, U, PRIORS, Wander({**Wander.none().values, "offset_rate_mps2": 1e-9}), TemperatureModel(), fixed=True
+    )
     for k in range(10):
         found.update(Record.of(building_window(random, **EXACT), 0.1 * k))
     found.step(found.changes(np.where(np.arange(12) == SYY, RATE, 0.0), u_rate=u_rate))

@@ -82,7 +82,7 @@ def test_what_drivers_state_counts_as_if_the_configuration_stated_it(*, backward
 @pytest.mark.slow
 def test_the_configuration_comes_before_the_driver() -> None:
     config = stating(drawn().config, prior=NEAR_TEXT, certificate=["flat"])
-    other = {"sensor": ("lowpass corner_hz=40",), "reference": ("lowpass corner_hz=30",)}
+    other: dict[str, tuple[str, ...]] = {"sensor": ("lowpass corner_hz=40",), "reference": ("lowpass corner_hz=30",)}
     assert same(calibrations(config, events(other)), calibrations(config, events({})))
 
 

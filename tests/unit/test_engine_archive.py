@@ -94,7 +94,8 @@ def test_archive_holds_all_and_audits_by_sh_alone(
     assert f"{target}: with the engines {name()}" in told
     for release in known_engines():  # whose wheels are not given
         assert release.id == engine_id() or f"not in it: engine {release.number}-{release.id}" in told
-    listed = dict(reversed(line.split("  ")) for line in (target / "SHA256SUMS").read_text().splitlines())
+    sums = (target / "SHA256SUMS").read_text().splitlines()
+    listed = {name: digest for digest, name in (line.split("  ") for line in sums)}
     files = {path.relative_to(target).as_posix(): path for path in target.rglob("*") if path.is_file()}
     assert listed == {
         member: hashlib.sha256(path.read_bytes()).hexdigest() for member, path in files.items() if member in listed

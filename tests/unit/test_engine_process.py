@@ -145,6 +145,7 @@ def test_thread_of_an_engine_is_allowed() -> None:
     assert begun(does + "thread.start()\nthread.join()") == "EngineFaultError: from a thread"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("does", "limits", "told"),
     [
@@ -268,6 +269,7 @@ def test_directory_for_engines_that_is_full_is_told(monkeypatch: pytest.MonkeyPa
         pass
 
 
+@pytest.mark.slow
 def test_frames_that_arrive_byte_by_byte_are_those_that_were_sent() -> None:
     sent = [[b"step", b"x" * 70_000, b""], [b"snapshot"]]
     unpacker = frames.Unpacker()

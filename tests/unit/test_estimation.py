@@ -85,7 +85,7 @@ def test_a_step_too_small_for_any_window_alone_is_followed() -> None:
     random = np.random.default_rng(2)
     process, exact = {"sensitivity_pct": 0.0}, {"stability_pct": 0.0}
     found = settled(random, process=process, certificate=exact, gate={"false_holds": 1e-9})
-    quiet = {"level_mps2": (0.0, 0.01, 0.0)}  # one tells S_yy to 1 %, the state knows it to 0.1 %
+    quiet: dict[str, Any] = {"level_mps2": (0.0, 0.01, 0.0)}  # one tells S_yy to 1 %, the state knows it to 0.1 %
     judged = hours(found, [building_window(random, S=OF_Y, **quiet) for _ in range(60)], first=10)
     assert set(actions(judged)) == {"take"}
     assert ("Syy", "stepped") in {(v.parameter, v.verdict) for j in judged for v in j.drift}
@@ -99,7 +99,8 @@ def test_u_covers_a_step_from_the_window_on_in_which_it_is_found() -> None:
     random = np.random.default_rng(2)
     process, exact = {"sensitivity_pct": 0.0}, {"stability_pct": 0.0}
     found, told = settled(random, process=process, certificate=exact, gate={"false_holds": 1e-9}), set[str]()
-    quiet, hour = {"level_mps2": (0.0, 0.01, 0.0)}, 10
+    quiet: dict[str, Any] = {"level_mps2": (0.0, 0.01, 0.0)}
+    hour = 10
     while "stepped" not in told:
         assert hour < 70
         [judged] = hours(found, [building_window(random, S=OF_Y, **quiet)], first=hour)

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from calib.excitation import detection
 from calib.excitation.window_verdict import Limits, judge
-from calib.excitation.windows import Points, detection, motion_parts, motion_windows
+from calib.excitation.windows import Points, motion_parts, motion_windows
 from calib.geometry import along, beside, clamp
 from calib.model import Window, WindowSums
 
@@ -234,7 +235,7 @@ def test_weak_tri_axial_motion_half_of_it_calm() -> None:
     parts = motion_parts(shown, RATE_HZ, detection.white_noise(shown))
     assert [kind for kind, _, _ in parts] == ["motion", "quiet"] * 3
     np.testing.assert_allclose([a / RATE_HZ for _, a, _ in parts], np.arange(0, 600, 100), atol=1.1)
-    du = np.gradient(u, axis=0) * RATE_HZ
+    du = np.asarray(np.gradient(u, axis=0)) * RATE_HZ
     quiet = Points(t, u @ S.T, u, du).part(*parts[1][1:])
     window = motion_windows(beside(np.eye(3)), quiet._replace(u=quiet.u + 0.006 * rng.normal(size=quiet.u.shape)))[0]
     assert not window.used

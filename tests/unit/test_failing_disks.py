@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from agent.audit.engines import Engines
-from agent.cli.audit import GivenFiles, audit_files
+from agent.cli.audit import audit_files
+from agent.cli.given import GivenFiles
+from agent.core.events import Event
 from agent.recording.files import recordings
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
@@ -30,7 +32,8 @@ import json, sys
 from pathlib import Path
 import numpy as np
 from agent.audit.engines import Engines
-from agent.cli.audit import GivenFiles, audit_files
+from agent.cli.audit import audit_files
+from agent.cli.given import GivenFiles
 from agent.delivery.history import History, StoredResult, StoreError
 from agent.delivery.store import Store
 from agent.recording.files import recordings
@@ -175,7 +178,7 @@ def test_a_sync_that_fails_gives_the_file_up_and_the_next_is_sound(
     monkeypatch.setattr(os, "fsync", failing_fsync)
     for number in range(60):
         if number == 0 or recorder.wants_rotation:
-            event = run_start(pipeline, number, recorder.next_file_sequence, 5 * SECOND + number * SECOND)
+            event: Event = run_start(pipeline, number, recorder.next_file_sequence, 5 * SECOND + number * SECOND)
         else:
             event = block("acc", 2 * number, rng)
         results = pipeline.step(event)

@@ -112,7 +112,7 @@ def test_the_supervision_logs_a_fault_as_an_error(
     monkeypatch.setattr(streams, "windows_in", broken)
     site: Site = begun(site_config())
     results = [r for r in site.play(3) if isinstance(r, WindowReport | StatusChange)]
-    supervisor = Supervisor(site_config(), "r", 0, None, SystemdNotifier({}))  # type: ignore[arg-type] - looked at by ticks
+    supervisor = Supervisor(site_config(), "r", 0, None, SystemdNotifier({}))  # type: ignore[arg-type]  # looked at by ticks
     lost = DeviceChange(device="s", state="lost", t_monotonic_ns=0, t_utc_ns=0)
     supervisor.on_event(lost, results)
     errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]

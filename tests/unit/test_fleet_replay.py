@@ -108,7 +108,15 @@ def test_dask_gives_the_same_bits(recordings: Path, tmp_path: Path) -> None:
     )
     assert distributed.__version__
     (tmp_path / "cluster.py").write_text(script)
-    told = [sys.executable, tmp_path / "cluster.py", "fleet", "replay", recordings, "-o", tmp_path / "dask"]
+    told: list[str | Path] = [
+        sys.executable,
+        tmp_path / "cluster.py",
+        "fleet",
+        "replay",
+        recordings,
+        "-o",
+        tmp_path / "dask",
+    ]
     done = subprocess.run(
         told, capture_output=True, text=True, timeout=120, env=os.environ | {"PYTHONPATH": os.getcwd()}
     )
@@ -229,6 +237,7 @@ def test_a_wrong_setting_is_refused_with_its_path_before_any_file_is_read(text: 
         ChangedSetting.of(text)
 
 
+@pytest.mark.slow
 def test_a_setting_that_a_recording_cannot_have_refuses_that_recording(recordings: Path) -> None:
     for setting, told in (
         ("channels.other.window_s=20", "channels.other: the recording has no such channel; there is mems"),

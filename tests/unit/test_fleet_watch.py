@@ -182,6 +182,7 @@ def test_a_visit_says_what_it_found_where_the_calibrations_are_told(
         if row["sensor"] == "c" and row["sequence"] >= visited:
             row["calibration_sequence"] = 4
             row["band_power"] = [*row["band_power"][:8], *(value / 0.97**2 for value in row["band_power"][8:])]
+    made: list[dict[str, Any]]
     made = [{"key": f"fieldcal/v1/bridge/middle/c/{what}", "sensor": "c", "run_id": "run", "sequence": sequence,
              "sensitivity": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, zz]]}
             for what, sequence, zz in (("calibration", 3, 2.0), ("calibration", 4, 1.94))]  # fmt: skip

@@ -70,6 +70,7 @@ def test_a_fault_is_told_in_the_same_words_with_the_remedy_of_a_notebook(tmp_pat
     assert str(error.value).endswith("; rename the columns; a unit may stand in a name: 'x [mg]'")
 
 
+@pytest.mark.slow
 def test_a_result_from_frames_is_that_of_the_files(tmp_path: Path) -> None:
     heads = ("Acc X [mg]", "Acc Y [mg]", "Acc Z [mg]")
     t, a = (np.asarray(REFERENCE[name]) for name in ("time_s", "a"))
@@ -93,7 +94,7 @@ def test_dates_with_a_zone_are_times() -> None:
         for time in (stamps, stamps.tz_localize("UTC").tz_convert("Europe/Rome"))
     )
     np.testing.assert_array_equal(zoned, naive)
-    np.testing.assert_allclose(naive - 1e9, SENSOR["time_s"], atol=3e-7)
+    np.testing.assert_allclose(np.asarray(naive) - 1e9, SENSOR["time_s"], atol=3e-7)
 
 
 @pytest.mark.parametrize("kind", TEXTS)

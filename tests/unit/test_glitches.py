@@ -84,6 +84,7 @@ def recorded(derivatives: int, spikes: float, steps: float, settings: Settings) 
     return windows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("derivatives", "spikes", "steps"),
     [(0, 50.0, 0.0), (0, 500.0, 0.0), (0, 5000.0, 0.0), (1, 0.0, 0.8), (1, 50.0, 0.0), (1, 5.0, 10.0), (2, 0.0, 0.1)],

@@ -46,7 +46,7 @@ def test_the_largest_guide_fits_and_a_larger_one_is_no_guide() -> None:
     assert len(whole) < guide_module.LARGEST_GUIDE
     assert read_guide(whole, b"", GATEWAY, None) is not None
     assert read_guide(whole + b" " * guide_module.LARGEST_GUIDE, b"", GATEWAY, None) is None
-    more = [
+    more: list[dict[str, Any]] = [
         {"prompt": text + "x"},
         {"sensor": "x" * 64},
         {"warnings": [Warned(1, "x")] * (guide_module.LINES_MAX + 1)},

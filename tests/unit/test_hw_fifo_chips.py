@@ -125,7 +125,7 @@ def test_lsm6dso_word() -> None:
 
 @given(st.integers(0, 3), st.lists(st.sampled_from(["next", "skip", "other", "odd"]), max_size=60), st.integers(0, 60))
 def test_lsm6dso_words_as_a_plain_reading(first: int, kinds: list[str], cut: int) -> None:
-    data, expected, breaks, counter, last = b"", [], [], first, first
+    data, expected, breaks, counter, last = b"", list[int](), list[int](), first, first
     for i, kind in enumerate(kinds):
         counter += {"next": 1, "skip": 2, "other": 0, "odd": 1}[kind]
         word = words(1 if kind == "other" else 2, counter, np.full((1, 3), i, np.int32))

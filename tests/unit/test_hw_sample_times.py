@@ -48,9 +48,9 @@ class Machine:
     ("driver", "twin", "options", "rate_error", "bias_us", "sd_us", "largest_us"),
     [
         (Adxl355, Adxl355Twin, {"rate_hz": 1000.0}, 3.3e-3, 50, 50, 150),
-        (Mpu6050, Mpu6050Twin, {"rate_hz": 1000.0}, 3.3e-3, 50, 50, 150),
+        pytest.param(Mpu6050, Mpu6050Twin, {"rate_hz": 1000.0}, 3.3e-3, 50, 50, 150, marks=pytest.mark.thorough),
         (Lsm6dso, Lsm6dsoTwin, {"rate_hz": 833.0}, 3.3e-3, 50, 50, 150),
-        (Adxl355, Adxl355Twin, {"rate_hz": 125.0}, 3.3e-3, 100, 120, 350),
+        pytest.param(Adxl355, Adxl355Twin, {"rate_hz": 125.0}, 3.3e-3, 100, 120, 350, marks=pytest.mark.thorough),
         # From poll to poll these clocks make a whole number of samples and 0.382: with 0.618, the golden ratio, polls
         # that are later by that part from one to the next would all come at the same part of a sample period.
         (Adxl355, Adxl355Twin, {"rate_hz": 125.0}, RESONANT_125_HZ, 100, 120, 350),

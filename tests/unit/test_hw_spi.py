@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ from hw.virtual.spi_bus import Controller, SpiBus
 HEADER = Path("/usr/include/linux/spi/spidev.h")
 NODE = "/dev/spidev0.0"
 FIELDS = [name for name, *_ in Transfer._fields_]
-PARTS = [
+PARTS: list[tuple[Any, Any, Any]] = [
     (Adxl355, Adxl355Options, Adxl355Twin),
     (Adxl345, Adxl345Options, Adxl345Twin),
     (Lsm6dso, Lsm6dsoOptions, Lsm6dsoTwin),
@@ -63,8 +63,8 @@ def test_numbers_are_those_of_the_kernels_header(tmp_path: Path) -> None:
 class Wire:
     """A device that notes the frames and answers with the bytes that it is given."""
 
-    spi_modes = (0, 1, 2, 3)
-    spi_highest_hz = 1e9
+    spi_modes: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
+    spi_highest_hz: ClassVar[float] = 1e9
 
     def __init__(self, answer: bytes = b"") -> None:
         self.frames: list[bytes] = []
@@ -138,7 +138,7 @@ def test_what_another_program_left_in_the_mode_does_not_matter(driver: Any, opti
     bus = SpiBus(chip(kind), adapter=Controller("wired high", wiring=0x04))
     bus.mode = 0x04 | 0x08 | 0x10 | 0x20 | 0x01
     with installed({NODE: bus}):
-        sensor = built(driver, options)
+        sensor = built(driver, options)  # type: ignore[type-abstract]
         sensor.open()
         sensor.close()
     assert bus.mode == 0x04 | options.spi.mode
@@ -150,7 +150,7 @@ def test_a_device_that_is_not_there(driver: Any, options: Any, kind: Any, idle: 
     # "got 0 vs e5", "got ff vs e5": Klipper issue 3637. It may be connected later, so it is lost, not misconfigured.
     bus = SpiBus(None, idle=idle)
     with installed({NODE: bus}):
-        sensor = built(driver, options)
+        sensor = built(driver, options)  # type: ignore[type-abstract]
         for ask in (sensor.open, sensor.identify):
             with pytest.raises(DeviceLost, match=f"no device answers, all bits read {idle & 1}; check its supply"):
                 ask()
@@ -166,7 +166,7 @@ def test_a_controller_that_does_not_deselect_between_frames_gets_one_frame_a_mes
     for adapter, joins in ((Controller("good"), True), (Controller("one selection", deselects=False), False)):
         for driver, options, kind in PARTS:
             with installed({NODE: SpiBus(chip(kind), adapter=adapter)}):
-                sensor = built(driver, options)
+                sensor = built(driver, options)  # type: ignore[type-abstract]
                 sensor.open()
                 assert sensor._device.joins == joins, kind
                 sensor.close()

@@ -15,9 +15,10 @@ from cryptography.x509.verification import PolicyBuilder, Store, VerificationErr
 
 from agent.cli.keys import keys
 from agent.config import Commands
+from agent.config.key_file import KeyFileError
 from agent.config.tls import TlsFiles, expiry_warning, tls_faults
 from agent.keys.certificates import issue, make_authority
-from agent.keys.files import KeyFileError, read_signing_key
+from agent.keys.files import read_signing_key
 
 
 def run(directory: Path, *arguments: str) -> Result:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -32,7 +34,7 @@ def test_a_bench_with_knocks_is_as_good_as_without() -> None:
 
     Spread by the filter, the knocks cost two to four of the four stays.
     """
-    clean, struck = [], []
+    clean, struck = list[Any](), list[Any]()
     for seed in SEEDS:
         late_s = np.abs(np.random.default_rng(seed).normal(0.0, 2e-3, 2000))
         for outcomes, hits in ((clean, None), (struck, knocked(1.0))):

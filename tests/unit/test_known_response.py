@@ -19,7 +19,7 @@ from calib.recorded.outcome import Outcome
 from calib.signal.known_response import UNKNOWN, KnownResponse, known_of
 from tests.pair import Filter, Pair, decimator, lowpass, moving_mean, pair
 
-EXACT = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
+EXACT: dict[str, Any] = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
 MOTION_HZ = (0.5, 20.0)
 U_CORNER = 0.1
 

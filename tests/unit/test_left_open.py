@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import msgspec
 import numpy as np
@@ -178,7 +178,9 @@ def test_the_agent_says_what_files_say(disturbed: Disturbance, source: str, leas
     of, _ = made(disturbed, 1, lowpass(1, 30.0))
     windows = [w for w in of.files.windows(0.0) if w.used]
     stated = Priors(reference=U_REFERENCE, reference_frequency_hz=of.reference_frequency_hz)
-    found = State(MEAN, U, stated, replace(Wander.none(), offset_rate_mps2=1e-9), TemperatureModel(), fixed=False)
+    found = State(
+        MEAN, U, stated, Wander({**Wander.none().values, "offset_rate_mps2": 1e-9}), TemperatureModel(), fixed=False
+    )
     for k, window in enumerate(windows):
         found.update(Record.of(window, k * 1e-3))
     band_hz = motion_band_hz(windows[:1])

@@ -94,7 +94,8 @@ def test_a_unit_that_is_not_meant_is_told(text: str, columns: str | None, said: 
 def test_units_of_time(tmp_path: Path) -> None:
     for unit, second in (("h", 3600.0), ("min", 60.0), ("days", 86400.0), ("ms", 1e-3)):
         found = read(
-            tmp_path, table(lambda k, second=second: f"{k / 100 / second:.15g}", f"Elapsed time ({unit}),x,y,z\n")
+            tmp_path,
+            table(lambda k, second=second: f"{k / 100 / second:.15g}", f"Elapsed time ({unit}),x,y,z\n"),  # type: ignore[misc]
         )
         np.testing.assert_allclose(found.time_s[:], np.arange(N) / 100, rtol=0, atol=1e-9)
         assert len(found.said) == 1  # the columns
@@ -171,7 +172,8 @@ def with_fields(*fields: str, delimiter: str = ",") -> str:
     """A table whose rows end with these fields, in which "#" is the number of the row."""
     names = ["time", "x", "y", "z"][: len(fields)]
     return "".join(
-        delimiter.join(f.replace("#", str(k)) for f in row) + "\n" for k, row in enumerate([names] + N * [fields])
+        delimiter.join(f.replace("#", str(k)) for f in row) + "\n"
+        for k, row in enumerate([names, *(N * [list(fields)])])
     )
 
 

@@ -62,10 +62,10 @@ def piped() -> Iterator[Piped]:
 
 
 def test_what_happens_is_an_object_a_line_with_its_fields(piped: Piped) -> None:
-    change = {"device": "mems", "t_monotonic_ns": 1, "t_utc_ns": 1}
+    change: dict[str, Any] = {"device": "mems", "t_monotonic_ns": 1, "t_utc_ns": 1}
     log_event(DeviceChange(**change, state="lost", message="I2C 1, 0x1d:\nEIO", attempt=2), [])
     log_event(Gap(device="mems", t_monotonic_ns=1, dropped=3, unit="lines", reason="not a number"), [])
-    pruned = {"first_file": 3, "last_file": 5, "last_sha256": "0" * 64, "bytes": 7}
+    pruned: dict[str, Any] = {"first_file": 3, "last_file": 5, "last_sha256": "0" * 64, "bytes": 7}
     log_event(Pruned(t_monotonic_ns=1, t_utc_ns=1, **pruned), [])
     command = Command(sensor="mems", verb="hold", t_monotonic_ns=1, t_utc_ns=1, key_id="k1", refused="expired")
     log_event(command, [window(1), calibration(2, qz_known=False), status(3), clock(4)])  # a routine result is not told

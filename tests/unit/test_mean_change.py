@@ -58,6 +58,7 @@ def test_an_offset_along_no_single_axis_is_nothing_else() -> None:
     assert "Q by as much" in found.told
 
 
+@pytest.mark.slow
 def test_no_change_says_nothing_and_each_cause_is_named_as_often_as_stated() -> None:
     """4000 draws, seed 3: a sound mean is never told (chance 1e-6 each); a true tilt is missed in one of 1000."""
     rng = np.random.default_rng(3)

@@ -155,8 +155,8 @@ def test_rests_beside_the_sine_are_left_out(rests_s: tuple[float, float], lag_s:
     """The table moves within the stretch only; it starts and stops at any phase."""
     runs = []
     for whole in each_axis(lag_s=lag_s, n=4000):
-        moving = np.arange(len(whole.time_s)) / 1000.0
-        moving = (moving >= rests_s[0]) & (moving < 4.0 - rests_s[1])
+        at_s = np.arange(len(whole.time_s)) / 1000.0
+        moving = (at_s >= rests_s[0]) & (at_s < 4.0 - rests_s[1])
         rest = np.array([0.3, -0.1, G])
         resting = np.where(moving, whole.reference, 0.0), np.where(moving[:, None], whole.indications, rest)
         runs.append(replace(whole, reference=resting[0], indications=resting[1]))

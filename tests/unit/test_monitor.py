@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -108,7 +108,8 @@ def test_hours_of_the_bus_are_kept_and_read_while_the_monitor_runs(site: Site, t
 def test_a_drift_stays_one_over_a_restart(site: Site, tmp_path: Path) -> None:
     place = ("site", "gw", "mems")
     with Served(site, tmp_path / "monitor") as served:
-        for number, told in enumerate(("drifting", "stepped"), start=1):
+        verdicts: tuple[Literal["drifting", "stepped"], ...] = ("drifting", "stepped")
+        for number, told in enumerate(verdicts, start=1):
             drift = DriftReport(run_id="r", sequence=number, sensor="mems", t_utc_ns=number, parameter="Sxx",
                                 verdict=told, change=1.0, u_change=1.0, rate=0.0, u_rate=0.0, onset_utc_ns=1,
                                 statistic=1.0, threshold=1.0, false_alarms_a_year=0.1, reason="r")  # fmt: skip

@@ -95,6 +95,7 @@ def test_results_come_back_whole_in_order_and_each_once(kept: Kept) -> None:
     assert list(kept.database.last_sequence().items()) == [("site/gw", 5), ("site/gw/ab", 1)]
 
 
+@pytest.mark.slow
 def test_results_of_one_batch_are_kept_as_one_by_one(kept: Kept) -> None:
     batch = [received_from(calibration(k), START + k) for k in (1, 2, 2, 3)]
     batch += [received_from(window(4), START, epoch="ab"), received_from(calibration(5, qz_known=False), START + 5)]

@@ -58,7 +58,7 @@ def test_a_killed_monitor_loses_nothing_and_keeps_nothing_twice(site: Site, tmp_
         found = []
         for results in KILLED_AT:
             running = monitor()
-            wait_for(lambda least=results: len(kept(engine)) > least)
+            wait_for(lambda least=results: len(kept(engine)) > least)  # type: ignore[misc]
             running.kill()
             found.append(len(kept(engine)))
         assert found[-1] < RESULTS  # else it was not killed on its way

@@ -81,6 +81,18 @@ def test_verdicts_and_states_are_told_once_and_old_ones_not() -> None:
     assert watch.update(2.0, NOW) == []
 
 
+def test_a_name_of_two_gateways_is_told_once_as_long_as_there_are_two() -> None:
+    fleet = Fleet()
+    watch = FleetWatch(fleet, Notices(), [])
+    fleet.set_alive("site", "gw", True)
+    told = []
+    for k, runs in enumerate((["a", "b"], ["a", "b"], ["a", "b"], [], ["a", "b"])):
+        fleet.set_doubled({"site/gw": runs} if runs else {}, {})
+        told.append([n.line for n in watch.update(float(k), NOW)])
+    both = ["site/gw: more than one gateway is on the bus under this name"]
+    assert told == [both, [], [], [], both]
+
+
 def test_a_silent_gateway_is_told_once_and_again_when_it_is_back() -> None:
     fleet = Fleet()
     watch = FleetWatch(fleet, Notices(silent_s=600), [])

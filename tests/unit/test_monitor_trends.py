@@ -16,7 +16,7 @@ from agent.monitor.database import DAY_NS, Database
 from agent.monitor.engines import Sqlite
 from agent.monitor.fleet import Fleet, dated
 from agent.monitor.onset import since
-from agent.monitor.trends import Trends, change_in, change_of
+from agent.monitor.trends import Shape, Trends, change_in, change_of
 from calib.state.state import DATED
 from tests.unit.results import calibration, status, window
 
@@ -75,7 +75,8 @@ def test_a_step_is_told_from_a_drift_and_a_verdict_that_the_history_does_not_sho
 
 def test_a_sound_history_shows_no_change() -> None:
     random, days = np.random.default_rng(4), np.arange(100.0)
-    found = [since(days, random.normal(size=100), shape) for _ in range(100) for shape in ("drifting", "stepped")]
+    shapes: tuple[Shape, ...] = ("drifting", "stepped")
+    found = [since(days, random.normal(size=100), shape) for _ in range(100) for shape in shapes]
     assert sum(each is not None for each in found) <= 4
     assert since(days[:7], days[:7], "drifting") is None  # too few
     assert since(days, np.ones(100), "drifting") is None

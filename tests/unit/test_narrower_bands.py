@@ -66,6 +66,7 @@ def test_a_resonance_that_hides_the_motion_in_all_windows() -> None:
     np.testing.assert_array_equal(again.values, found.values)  # what was tried before leaves no trace
 
 
+@pytest.mark.slow
 def test_a_resonance_contradicts_filters_that_are_stated_flat() -> None:
     """The reference's resonance of Q 33 at 2.8 Hz, in motion to 10 Hz: with filters stated flat S was valid and -19.8
     +- 1.0, and the refusal without them said to state so."""
@@ -106,7 +107,7 @@ def test_a_notch_just_above_the_narrower_band_does_not_bend_s() -> None:
     """Limited to 5.4 Hz the bands deviate by less than 0.1 % from one response, and S is 0.2 % off (7 u): 3.8 Hz shows
     it."""
     made = pair(3, notched)
-    exact = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
+    exact: dict[str, Any] = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
     at_hz = Priors(reference_frequency_hz=made.reference_frequency_hz, **exact)
     bent = adjusted(made.files, at_hz, band_hz=(0.0, 5.402))
     assert np.abs(np.diag(bent.sensitivity - made.sensitivity)).max() > 1e-3

@@ -20,7 +20,7 @@ CLAMP = [{"theta_deg": 35, "alpha_deg": alpha} for alpha in (0, 120, 240)]
 TIMED = [{**stop, "start_s": 15.0 * k, "stop_s": 15.0 * k + 12.0} for k, stop in enumerate(CLAMP)]
 FACES = [{"gravity_mps2": [sign * 9.81 * (i == k) for k in range(3)]} for i in range(3) for sign in (1, -1)]
 PUBLIC = "dzWPEyU0pMzL6HqvwwMvtIvoksq07njf+E/rdjfIIgM="
-CLOCK = {"t_monotonic_ns": 0, "t_utc_ns": 0}
+CLOCK: dict[str, Any] = {"t_monotonic_ns": 0, "t_utc_ns": 0}
 FIRST = "turn the sensor to theta 35 deg, alpha 0 deg and stay 20 s (positions used: 0 of 3)"
 
 
@@ -178,7 +178,8 @@ def test_held_and_what_ends_it() -> None:
 
 
 def test_an_estimate_cannot_be_accepted_where_commands_are_off() -> None:
-    for channel in ({}, {"gate": {"policy": "propose"}}):
+    channels: tuple[dict[str, Any], ...] = ({}, {"gate": {"policy": "propose"}})
+    for channel in channels:
         guide = NextSteps(configured(positions=CLAMP, **channel), turns_itself=False)
         told = said(guide, estimate(7), status(8, "COLLECTING" if channel else "HELD"))
         assert "enable [commands] in the configuration" in told

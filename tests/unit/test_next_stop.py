@@ -96,6 +96,7 @@ def test_four_rests_are_a_tetrahedron_and_what_is_said_of_more_rests_follows_fro
     assert told.mostly == 5 + next(k for k, factor in enumerate(seen) if factor * even[4 + k] <= 5e-4) == 7
 
 
+@pytest.mark.slow
 def test_the_set_of_stops_is_the_best_of_all():
     """Of all sets of three stops on the clamp, and of the sets of four to which exchanges lead: tried one by one."""
     session = _session(TWO[::4], STATED, WantedUncertainty(5e-4, 1.0))

@@ -78,6 +78,7 @@ def test_half_of_a_slow_motion_is_lost_and_no_more() -> None:
         assert u[[0, 4, 8]].mean() < 2.0 * clean.calibration.standard_uncertainty[[0, 4, 8]].mean()
 
 
+@pytest.mark.slow
 def test_white_noise_of_the_reference_is_no_drift_of_the_sensor() -> None:
     """Means of ten samples scatter by a third of the limit of a drift; before, all windows were refused for it."""
     white = noise(lambda f: np.full(len(f), 0.1 * density(SLOW_HZ)), of_reference=True)

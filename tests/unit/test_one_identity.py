@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from agent.cli.show import show
-from agent.core.events import Acceleration, CalibrationUpdate
+from agent.core.events import Acceleration, CalibrationUpdate, Event, Output
 from agent.core.outcome import again
 from agent.delivery.calibrations import calibrations
 from agent.delivery.history import FILE_NAME, History, StoredResult
@@ -88,11 +88,11 @@ def test_accelerations_name_the_calibration_that_was_made() -> None:
     first = begun(config)
     made = updates(first.play(4))[-1]
     site = begun(config, kept=memories(first), day=1.0, last=made.sequence + 100)
-    named = set()
+    named = set[tuple[str, int]]()
     step = site.pipeline.step
 
-    def noted(event: object) -> list[object]:
-        outputs = list(step(event))  # type: ignore[arg-type]
+    def noted(event: Event) -> list[Output]:
+        outputs = step(event)
         named.update((o.calibration_run_id, o.calibration_sequence) for o in outputs if isinstance(o, Acceleration))
         return outputs
 
@@ -136,6 +136,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
+@pytest.mark.slow
 def test_a_report_after_a_restart_shows_the_run_in_which_it_was_made(recorded: Path, tmp_path: Path) -> None:
     before = gather([recorded], None)
     directory = tmp_path / "data"

@@ -119,6 +119,7 @@ def test_the_unit_is_in_table_report_and_certificate(tmp_path: Path, capsys: pyt
     assert r"\milli\volt\metre\tothe{-1}" in dcc(found, CertificateSigner(None, "")).decode()
 
 
+@pytest.mark.slow
 def test_a_unit_that_contradicts_the_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result, _ = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
     stated = statements(tmp_path)
@@ -167,6 +168,7 @@ def test_an_output_in_g_is_shown_in_g_per_g_and_mg(
     np.testing.assert_array_equal(read_earlier(tmp_path / "earlier.xml")[0][:9], np.ravel(told["sensitivity"]))
 
 
+@pytest.mark.slow
 def test_a_reference_of_velocity_is_a_vibrometer(tmp_path: Path) -> None:
     t, a = REFERENCE["time_s"], REFERENCE["a"]
     velocity = {"time_s": t, "v": np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t))])}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
 from calib.estimate.statements import Statements
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.model import Pose
+from calib.model import PARAMETERS, Pose
 from calib.state.state import State
 from calib.state.thinning import merged
 from calib.windows.record import Record
@@ -28,7 +26,7 @@ from tests.unit.results import calibration
 
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
-STILL = replace(Wander.none(), offset_rate_mps2=1e-9)
+STILL = Wander({**Wander.none().values, "offset_rate_mps2": 1e-9})
 PRIORS = Priors(gravity_mps2=0.03, offset_mps2=1e-3, lag_window_s=0.0, reference=1e-3, reference_per_k=2e-4)
 BY_DEFAULT = TemperatureModel(1, 1, settles=True)
 OF_S = np.array([[1e-4, 2e-4, 0.0], [-3e-4, -1e-4, 0.0], [0.0, 1e-4, 2e-4]])
@@ -159,3 +157,8 @@ def test_exported_samples_are_corrected_at_their_temperature() -> None:
     found = acceleration(V, update, 25.0)
     assert found is not None
     np.testing.assert_allclose(found, a, rtol=1e-12)
+
+
+def test_each_element_of_s_and_q_may_follow_the_temperature_late() -> None:
+    names = [quantity.name for quantity, _ in TemperatureModel(1, 1, 10.0, settles=True).behind(1.0)]
+    assert names == [f"{name}_behind" for name in PARAMETERS]

@@ -73,11 +73,11 @@ def test_each_contribution_is_what_the_fault_does_on_the_bench(name: str) -> Non
 
 
 def test_contributions_that_are_off_by_default() -> None:
-    by_position = replace(PRIORS, offset_mps2=0.0, offset_position_mps2=0.05)
+    by_position = PRIORS.with_values({"offset_mps2": 0.0, "offset_position_mps2": 0.05})
     moved = Faults(offset_mps2=0.05 * np.outer(np.eye(5)[2], np.eye(3)[1]))
     assert touched(QUIET, "offset_y[method 3, 30 deg]", moved, by_position) == {3}
     piezo = replace(PIEZO, noise_mps2=0.0, sensitivity=np.diag(np.diag(PIEZO.sensitivity)))
-    cornered = replace(PRIORS, sensor_corner_hz=0.2)
+    cornered = PRIORS.with_values({"sensor_corner_hz": 0.2})
     # |H| for Methods 1 and 2, its real part for Method 3: 0.2 and 0.4 %
     assert touched(piezo, "sensor_corner", Faults(corner_hz=0.2), cornered) == {1, 2, 3}
 

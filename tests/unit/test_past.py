@@ -67,7 +67,7 @@ class Dense:
         covariance, count = factor @ factor.T, 12 * len(self.days)
         self.values = found[:count].reshape(-1, 12)
         self.covariance = np.array([covariance[k : k + 12, k : k + 12] for k in range(0, count, 12)])
-        triangle = np.linalg.qr(table, mode="r")
+        triangle = np.asarray(np.linalg.qr(table, mode="r"))
         self.cost = float(triangle[-1, -1] ** 2 + 2.0 * np.log(np.abs(triangle.diagonal()[:-1])).sum())
         self.step, self.u_step = found[self._step], np.sqrt(covariance[self._step, self._step])
 

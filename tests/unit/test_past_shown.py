@@ -92,6 +92,7 @@ def test_table_csv_and_json_say_the_same(kept: Path, tmp_path: Path, capsys: pyt
     np.testing.assert_allclose([epoch["t_utc_ns"] for epoch in past["epochs"]], stops, rtol=0, atol=1e6)
 
 
+@pytest.mark.slow
 def test_recordings_tell_the_same_past_as_the_data_directory(
     kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -101,12 +102,13 @@ def test_recordings_tell_the_same_past_as_the_data_directory(
     assert told["recordings"] == [str(kept / RECORDING)]
     assert told["past"] == [shown(capsys, kept)]
     (tmp_path / "no.mcap").write_bytes(b"x" * 100)
-    for arguments, words in (
+    refused: tuple[tuple[list[str | Path], str], ...] = (
         ([kept / RECORDING], "recordings tell the past; add --past"),
         (["--past", kept / RECORDING, "--data-dir", kept], "--data-dir belongs to a data directory; remove it"),
         (["--past", tmp_path / "no.mcap"], "damaged at byte 0"),
         (["--past", tmp_path / "none.mcap"], "No such file"),
-    ):
+    )
+    for arguments, words in refused:
         status, out, err = run(capsys, "show", *arguments)
         assert (status, out) == (2, "")
         assert words in err
@@ -194,7 +196,8 @@ def test_stationxml_has_the_channels_of_the_miniseed_of_the_same_recording(
         return run(capsys, "export", kept / RECORDING, "-o", tmp_path / name, *more)
 
     assert export("a.mseed")[0] == 0
-    for name, more in (("a.xml", []), ("b.xml", []), ("c.xml", ["--data-dir", kept])):
+    beside: dict[str, list[str | Path]] = {"a.xml": [], "b.xml": [], "c.xml": ["--data-dir", kept]}
+    for name, more in beside.items():
         assert export(name, "--corrected", *place, *more)[::2] == (0, "")
     first, again, by_store = ((tmp_path / f"{name}.xml").read_bytes() for name in "abc")
     assert first == again == by_store
@@ -235,6 +238,7 @@ def test_samples_between_two_epochs_are_corrected_by_what_is_between_their_value
     np.testing.assert_allclose(a, (V - 0.5 - 0.2) / 1.01, rtol=1e-12)
     for hours, (size, Q) in ((-24.5, sides[0]), (0.9, sides[1])):
         a, _ = smoothed.acceleration("A", V, EPOCH_NS + round(hours * hour_ns), None)
+        assert a is not None
         np.testing.assert_allclose(a, (V - Q) / size, rtol=1e-12)
     a, why = smoothed.acceleration("A", V, EPOCH_NS + 61 * hour_ns // 60, None)
     assert a is None
@@ -337,11 +341,12 @@ def test_what_cannot_be_corrected_is_refused_with_a_remedy(
     kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     to = tmp_path / "a.csv"
-    for arguments, words in (
+    refused: tuple[tuple[list[str | Path], str], ...] = (
         (["-o", tmp_path / "a.uff"], "--corrected writes one file with the ending .csv or .parquet"),
         (["-o", to, "--device", "reference"], "reference has 1 axis; S and Q are those of three axes"),
         (["-o", to, "--device", "other"], "has no samples of 'other'"),
-    ):
+    )
+    for arguments, words in refused:
         status, _, err = run(capsys, "export", "--corrected", kept / RECORDING, *arguments)
         assert (status, to.exists()) == (2, False)
         assert words in err

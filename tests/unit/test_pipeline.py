@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from agent.config import parse_config
-from agent.core.events import CalibrationUpdate, DeviceChange, Result, StatusChange, Tick, WindowReport
+from agent.core.events import CalibrationUpdate, DeviceChange, Output, StatusChange, Tick, WindowReport
 from agent.core.pipeline import Pipeline
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 
@@ -112,7 +113,7 @@ def played(
     nominal_hz: float = 100.0,
     true_hz: float = 100.0,
     step: int = 1,
-) -> list[Result]:
+) -> list[Output]:
     """All results of a run through the schedule."""
     found = pipeline(reference, nominal_hz)
     noise = np.random.default_rng(1)
@@ -163,7 +164,7 @@ def test_a_sequence_that_counts_microseconds_is_a_reason_and_not_a_full_memory()
     assert {w.reason for w in windows} == {"s: its sample numbers and arrivals do not make a clock"}
 
 
-def statuses(results: list[Result]) -> list[str]:
+def statuses(results: Sequence[Output]) -> list[str]:
     return [r.status for r in results if isinstance(r, StatusChange)]
 
 

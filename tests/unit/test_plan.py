@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -129,17 +130,18 @@ def test_hostile_requests_are_refused(served: Served) -> None:
     assert served.ask("/api/plan/picture", "POST", b"<svg/>", anna).status == 400
     too_large = anna | {"content-length": str(LARGEST_PICTURE + 1)}
     assert served.ask("/api/plan/picture", "POST", b"", too_large).status == 413
-    for told in (
+    refused: tuple[Any, ...] = (
         [], {}, {"place": NAMES}, {"place": NAMES, "at": [0]}, {"place": NAMES, "at": [0, 1.1]},
         {"place": NAMES, "at": [-0.1, 0]}, {"place": NAMES, "at": ["0", 0]}, {"place": "a/b", "at": [0, 0]},
         {"place": "a/b/c/d", "at": [0, 0]}, {"place": "a/b/<img>", "at": [0, 0]},
         {"place": f"a/b/{'c' * 64}", "at": [0, 0]}, {"place": NAMES, "at": [0, 0], "more": 1},
-    ):  # fmt: skip
+    )  # fmt: skip
+    for told in refused:
         assert place(served, anna, told).status == 400
-    for told in (
+    for text in (
         '{"place": "site/gw/mems", "at": [NaN, 0]}',
         '{"place": "site/gw/mems", "at": [1e999, 0]}',
         "[" * 3000,
     ):
-        assert served.ask("/api/plan/position", "POST", told, anna).status == 400
+        assert served.ask("/api/plan/position", "POST", text, anna).status == 400
     assert served.ask("/api/plan", headers=anna).json == before

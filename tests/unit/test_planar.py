@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,7 +125,7 @@ def test_noise_tells_nothing_of_s_across_the_motion_however_many_windows_there_a
     S = np.eye(3) + u * np.random.default_rng(4).normal(size=(3, 3))
     windows = windows_along(along, 240, 5, S)
     covariance = np.diag(np.append(u.ravel(), np.full(3, 0.5)) ** 2)
-    stated = {"offset_mps2": 0.002, "gravity_direction_rad": 0.002}
+    stated: dict[str, Any] = {"offset_mps2": 0.002, "gravity_direction_rad": 0.002}
     known = adjust(windows, Priors({}, np.append(np.eye(3), np.zeros(3)), covariance, **stated))
     across = np.linalg.svd(along[None])[2][1:]
     of_row = [known.mean[3 * i : 3 * i + 3] - np.eye(3)[i] for i in range(3)]

@@ -59,7 +59,7 @@ def taken(channel: Channel, times: int) -> Estimation:
     return found
 
 
-SETS = {
+SETS: dict[str, tuple[list[dict[str, Any]], dict[str, Any]]] = {
     "three alphas": (clamped((35, 0), (35, 120), (35, 240)), {}),
     "two alphas": (clamped((35, 0), (35, 120)), {}),
     "two alphas, two thetas": (clamped((35, 0), (35, 120), (55, 0)), {}),

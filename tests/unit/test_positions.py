@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from agent.config import Config, ConfigError, parse_config
-from agent.core.events import Command, DeviceChange, Result, StatusChange, WindowReport
+from agent.core.events import Command, DeviceChange, Output, StatusChange, WindowReport
 from agent.core.pipeline import Pipeline
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 
@@ -37,7 +37,7 @@ def configured(**keys: Any) -> Config:
     return parse_config({"devices": devices, "channels": [channel | keys]}, "test")
 
 
-def turned(faces: Sequence[np.ndarray], seed: int = 1) -> np.ndarray:
+def turned(faces: np.ndarray | Sequence[np.ndarray], seed: int = 1) -> np.ndarray:
     """Indications (n, 3): each face for STAY_S, from one to the next in TURN_S."""
     times, forms = [], []
     for k, face in enumerate(faces):
@@ -71,7 +71,7 @@ def blocks(values: np.ndarray, *, late_s: float = 0.001, lost: Sequence[slice] =
     return made
 
 
-def played(pipeline: Pipeline, events: Sequence[Any]) -> list[Result]:
+def played(pipeline: Pipeline, events: Sequence[Any]) -> list[Output]:
     return [result for event in events for result in pipeline.step(event)]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -114,7 +112,7 @@ def test_none_is_all_zero_and_a_name_that_is_not_there_is_refused(stated: type[P
 
 
 def test_one_number_is_replaced_and_the_others_stay() -> None:
-    found = replace(Priors({"gravity_mps2": 0.2}, lag_s=0.5), angle_rad=0.1)
+    found = Priors({"gravity_mps2": 0.2}, lag_s=0.5).with_values({"angle_rad": 0.1})
     assert (found.angle_rad, found.lag_s, found.gravity_mps2) == (0.1, 0.5, 0.2)
 
 

@@ -131,7 +131,7 @@ def test_the_message_with_byte_strings_has_the_bytes_of_the_schema() -> None:
 
 def hostile(**changes: Any) -> bytes:
     """A block of four samples of one axis, with some fields changed."""
-    fields = {
+    fields: dict[str, Any] = {
         "axes": 1, "nominal_rate_hz": 1.0, "burst_sizes": b"\4", "order": 1, "first_values": [5], "differences": b"abc",
     }  # fmt: skip
     return pb.RawBlock(**(fields | changes)).SerializeToString()

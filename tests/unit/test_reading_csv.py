@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.calibrate.tables import ReferenceTable, SensorTable, read_reference, read_sensor
+from agent.calibrate.tables import read_reference, read_sensor
 from agent.cli.main import run_cli
 from agent.reading import delimited
 from agent.reading.source import TableError
+from calib.recorded.table import ReferenceTable, SensorTable
 from calib.recorded.units import sensitivity_of
 
 G = 9.80665

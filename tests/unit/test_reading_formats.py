@@ -7,6 +7,7 @@ import struct
 import wave
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_a_bag_without_imu(tmp_path: Path) -> None:
 # Parquet and Feather
 
 
-def frame() -> object:
+def frame() -> Any:
     import pandas
 
     pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra files)")

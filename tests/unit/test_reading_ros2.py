@@ -70,7 +70,7 @@ def imu(k: int, order: str = "<", samples: int = 2) -> bytes:
     cdr.text("label").put("B", 1).put("f", 21.5).put("h", 7, round(V[k, 1]), 7).put("I", samples)
     for n in range(samples):
         cdr.put("I", k % 3).put("d", *[0.5] * (k % 3))
-        cdr.put("d", V[k, 0] if n else 9.0).put("f", 9.0, np.float32(V[k, 2]))
+        cdr.put("d", V[k, 0] if n else 9.0).put("f", 9.0, float(np.float32(V[k, 2])))
     return cdr.put("Q", ns // 10**6).message
 
 
@@ -121,6 +121,7 @@ def test_numbers_of_any_topic(order: str, tmp_path: Path) -> None:
     expected = np.column_stack([V[:, 0], np.round(V[:, 1]), V[:, 2].astype(np.float32)])
     np.testing.assert_array_equal(found.v[:], expected)
     np.testing.assert_allclose(found.time_s[:], TIME_S, rtol=1e-12, atol=1e-12)
+    assert found.temperature_degc is not None
     np.testing.assert_array_equal(found.temperature_degc[:], 21.5)
     reference = read_reference(path, described=described)
     np.testing.assert_allclose(reference.x[:][:, 0], 9.80665e-3 * V[:, 0], rtol=1e-14)

@@ -72,6 +72,7 @@ def test_a_corrected_result_is_that_of_the_same_data_with_the_new_certificate(re
         assert corrected["largest_change_in_u"] > 0.5
 
 
+@pytest.mark.slow
 def test_a_recording_and_a_data_directory_have_the_same_results_and_each_is_corrected_once(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

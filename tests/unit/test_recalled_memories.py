@@ -103,6 +103,7 @@ def values(update: Result) -> tuple[object, ...]:
 
 
 # The last file: all of the run, its second half, and one without a window, which has all from its snapshot.
+@pytest.mark.slow
 @pytest.mark.parametrize("rotate_at", [(), (25,), (25, 39)])
 def test_a_lost_store_comes_back_with_what_the_estimation_knew(tmp_path: Path, rotate_at: Sequence[int]) -> None:
     results, memories = recorded(tmp_path, rotate_at)
@@ -169,7 +170,9 @@ def test_an_event_whose_results_were_torn_off_changes_nothing(tmp_path: Path) ->
     recorder.record(last, steps[last].event, [])
     recorder.sync()
     ((_, torn),) = recordings(tmp_path / "torn")
-    (memory,) = RECALL(torn, None) or ()
+    memories = RECALL(torn, None)
+    assert memories is not None
+    (memory,) = memories
     recorder.close()
     assert (memory.sequence, unpack(memory.state)["in_force"]) == (before[-1], None)
 

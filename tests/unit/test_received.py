@@ -70,7 +70,7 @@ def test_what_is_no_result_is_none(data: bytes) -> None:
 @pytest.mark.parametrize("field", ["sensitivity", "offset", "standard_uncertainty", "covariance", "determined"])
 def test_a_calibration_of_another_shape_is_none(field: str) -> None:
     fields = record(7, "calibration").fields
-    for value in (fields[field][:-1], fields[field] * 2, []):
+    for value in (fields[field][:-1], fields[field] * 2, list[float]()):
         assert receive(f"{KEY}/mems/calibration", msgspec.json.encode(fields | {field: value}), None) is None
 
 

@@ -20,11 +20,12 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from agent.core.events import Gap, Tick
-from agent.recording.files import FILE_METADATA, recordings
+from agent.recording.files import recordings
 from agent.recording.integrity import check_integrity
 from agent.recording.messages import encode
 from agent.recording.reading import RecordedStep, RecordingReader
 from agent.recording.records import FileRecord, FileRecordError, walk
+from agent.recording.results_chain import FILE_METADATA
 from agent.recording.writer import Recorder
 from tests.replay.stand_in import CONFIG, EPOCH_NS, SECOND, StandIn, block, happenings, record_run, run_start
 

@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def calibrated(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+def calibrated(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     assert run_cli([*arguments, "--plain", "--json", "-"]) in (0, 3), capsys.readouterr().err
     found = json.loads(capsys.readouterr().out)
     assert isinstance(found, dict)
@@ -84,6 +85,7 @@ def test_the_same_s_and_q_from_every_format(line: str, site: Path, capsys: pytes
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, atol=1e-9 * 26000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [line for line in COMMANDS if "run.mcap" in line or ".wav" in line])
 def test_commands_with_files_of_one_rate(line: str, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if ".wav" in line:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,17 +22,19 @@ STABILITY, CONSTANT, WALK = 0.005, 0.001, 0.002  # relative: of the reference a 
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
 # Windows of the building tell S_yy to 0.02 %, so that the reference decides.
-EXACT = {"level_mps2": (0.0, 0.5, 0.0), "noise_mps2": 0.001}
+EXACT: dict[str, Any] = {"level_mps2": (0.0, 0.5, 0.0), "noise_mps2": 0.001}
 SYY = 4
 
 
 def drifting(stability: float = STABILITY, walk: float = WALK) -> State:
     priors = Priors(reference=CONSTANT, reference_drift=stability, offset_mps2=1e-3, rotation_rad=0.0)
-    wander = replace(
-        Wander.none(),
-        offset_rate_mps2=1e-9,
-        reference_drift=stability / np.sqrt(YEAR_DAYS),
-        sensitivity=walk / np.sqrt(YEAR_DAYS),
+    wander = Wander(
+        {
+            **Wander.none().values,
+            "offset_rate_mps2": 1e-9,
+            "reference_drift": stability / np.sqrt(YEAR_DAYS),
+            "sensitivity": walk / np.sqrt(YEAR_DAYS),
+        }
     )
     return State(MEAN, U, priors, wander, TemperatureModel(), fixed=True)
 

@@ -11,6 +11,7 @@ from calib.adjustment.adjustment import Adjustment, adjust
 from calib.estimate.nuisances import Priors
 from calib.estimate.reference_share import shared_covariance
 from calib.estimate.wander import TemperatureModel, Wander
+from calib.model import Array
 from calib.state.state import State
 from calib.windows.record import Record
 from tests.building_windows import building_window
@@ -66,7 +67,8 @@ def test_a_corrected_state_is_that_of_the_same_data_with_the_other_certificate(s
 
 @pytest.mark.slow
 def test_the_difference_of_two_children_of_one_reference_has_the_u_that_is_stated() -> None:
-    random, parts = np.random.default_rng(SEED), {"shared": [], "alone": []}
+    random = np.random.default_rng(SEED)
+    parts: dict[str, list[Array]] = {"shared": [], "alone": []}
     for _ in range(REFERENCES):
         error = random.normal(0.0, U_REFERENCE, 3)
         one, other = (child(random, error) for _ in range(2))

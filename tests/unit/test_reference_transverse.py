@@ -34,9 +34,9 @@ def recorded(seed: int, u_pct: float) -> tuple[Outcome, np.ndarray]:
     random = np.random.default_rng([20261127, seed])
     S, T = np.eye(3) + 0.02 * random.standard_normal((3, 3)), _drawn(random)
     t = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
-    a = sum(
-        2.0 * np.sin(2.0 * np.pi * hz * t[:, None] + random.uniform(0.0, 6.28, 3)) for hz in (1.1, 1.7, 2.3, 3.1, 4.7)
-    )
+    a = np.zeros((len(t), 3))
+    for hz in (1.1, 1.7, 2.3, 3.1, 4.7):
+        a += 2.0 * np.sin(2.0 * np.pi * hz * t[:, None] + random.uniform(0.0, 6.28, 3))
     u = a @ (np.eye(3) + T).T + 0.002 * random.standard_normal(a.shape)
     V = a @ S.T + 0.1 + 0.002 * random.standard_normal(a.shape)
     reference = {"time_s": t, "ax": u[:, 0], "ay": u[:, 1], "az": u[:, 2]}

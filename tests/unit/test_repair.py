@@ -11,9 +11,9 @@ from mcap.reader import make_reader
 
 from agent.recording.files import recordings
 from agent.recording.integrity import check_integrity
-from agent.recording.reading import RecordingReader
+from agent.recording.reading import REPAIR_METADATA, RecordingReader
 from agent.recording.records import walk
-from agent.recording.repair import REPAIR_METADATA, TAIL_ATTACHMENT, TAIL_MAX, close_torn
+from agent.recording.repair import TAIL_ATTACHMENT, TAIL_MAX, close_torn
 from tests.replay.stand_in import record_run
 
 NAME = "fieldcal-000001.mcap"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from hw.virtual.presets import COUNTS_PER_MPS2, plain
 from hw.virtual.schedule import Schedule, clamped
 from tests.pair import Filter, Pair, decimator, flat, highpass, lowpass, moving_mean, pair, resonance, sinc3
 
-EXACT = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
+EXACT: dict[str, Any] = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
 ALIKE = {
     "nothing": flat,
     "low-pass, order 1": lowpass(1, 15.0),
@@ -36,13 +37,13 @@ ALIKE = {
 }
 
 
-def calibrated(made: Pair, **stated: float) -> Outcome:
+def calibrated(made: Pair, **stated: Any) -> Outcome:
     return adjusted(made.files, Priors(**{**EXACT, "reference_frequency_hz": made.reference_frequency_hz, **stated}))
 
 
-def not_limited(made: Pair, **stated: float) -> Outcome:
+def not_limited(made: Pair, **stated: Any) -> Outcome:
     """No narrower band is tried: the one that is stated holds all motion."""
-    at_hz = {**EXACT, "reference_frequency_hz": made.reference_frequency_hz, **stated}
+    at_hz: dict[str, Any] = {**EXACT, "reference_frequency_hz": made.reference_frequency_hz, **stated}
     return adjusted(made.files, Priors(**at_hz), band_hz=(0.0, 1e3))
 
 
@@ -68,6 +69,7 @@ def test_a_sensor_that_is_late_by_a_sixth_of_a_cycle() -> None:
     assert np.abs(error / u).max() < 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 def test_a_delay_of_two_and_a_half_periods_of_the_motion(side: str) -> None:
     """A linear-phase filter of 63 taps comes 258 ms late, 13 times the usual standard uncertainty of a lag."""
@@ -191,6 +193,7 @@ def test_an_ac_coupled_reference_needs_no_option_but_its_coupling(tmp_path: Path
     made = pair(4, highpass(0.1), seconds=120.0)
     sensor, reference = made.files._sensor, made.files._reference
     assert reference is not None
+    stream: Any
     for name, head, stream in (("sensor", "time_s,vx,vy,vz", sensor), ("reference", "time_s,ax,ay,az", reference)):
         rows = np.column_stack([np.arange(len(stream._values)) / 100.0, stream._values])
         np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header=head, comments="")
@@ -210,8 +213,7 @@ def test_an_ac_coupled_reference_needs_no_option_but_its_coupling(tmp_path: Path
 def test_a_few_points_by_chance_are_no_result() -> None:
     """In all but ten seconds the sensor does not follow: the wire of the reference was loose."""
     made = pair(0, flat, seconds=300.0)
-    loose = made.files._reference
-    assert loose is not None
+    loose: Any = made.files._reference
     loose._values[1000:] = np.random.default_rng(1).normal(size=loose._values[1000:].shape)
     (pose,) = made.files.poses
     made.files.poses = [replace(pose, stop_s=10.0), replace(pose, start_s=10.0)]

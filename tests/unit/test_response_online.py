@@ -82,6 +82,7 @@ def test_a_filter_changes_neither_s_at_its_frequency_nor_q(name):
     assert (np.abs(steady - at_0hz) <= u_steady).all()
 
 
+@pytest.mark.slow
 def test_a_filter_of_the_reference_acts_the_other_way():
     name = "low-pass of order 2, 31 Hz"
     found, without = told(name, "reference"), told("flat")

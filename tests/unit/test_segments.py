@@ -18,7 +18,8 @@ from calib.windows.sums import pool, window_sums
 @pytest.mark.parametrize(("size", "counts"), [(1, [9] * 7), (3, [27, 36]), (7, [63]), (9, [63])])
 def test_the_sums_stay(size: int, counts: list[int]) -> None:
     rng = np.random.default_rng(1)
-    sums = window_sums(*(rng.normal(size=(63, k)) for k in (1, 1, 3)), np.arange(0, 64, 9))
+    u, du, V = (rng.normal(size=(63, k)) for k in (1, 1, 3))
+    sums = window_sums(u, du, V, np.arange(0, 64, 9))
     joined = segments.with_joined(sums, size)
     assert joined.count.tolist() == counts
     before, after = pool(sums), pool(joined)

@@ -115,6 +115,7 @@ def test_sensitivity_and_orientation_of_a_seismometer(
     assert not other.comments
 
 
+@pytest.mark.slow
 def test_an_accelerometer_beside_a_seismometer_feels_gravity(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found, _ = calibrated(site, "ACC", capsys)
     told = {each["channel"].rpartition(".")[2]: each for each in found["station"]}
@@ -125,6 +126,7 @@ def test_an_accelerometer_beside_a_seismometer_feels_gravity(site: Path, capsys:
     assert np.all(U < 4e6 * 0.25)  # the dip of 0.5 deg is 0.086 m/s2; u of gravity, of the rotation and of Q
 
 
+@pytest.mark.slow
 def test_the_pair_of_obspy(site: Path) -> None:
     """A vertical pair of seismometers in ObsPy's own test data, as its files are; ObsPy's correction is the same."""
     data = Path(obspy.__file__).parent / "signal" / "tests" / "data"

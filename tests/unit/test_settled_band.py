@@ -18,17 +18,34 @@ from calib.windows.bands import motion_band_hz
 from calib.windows.record import WIDER, Record
 
 
+def motion(record: Record) -> tuple[float, float]:
+    """The band of its motion, which a record has."""
+    assert record.motion_hz is not None
+    return record.motion_hz
+
+
+def calm(record: Record) -> Record:
+    """What is left of a record in the band of the calm motion."""
+    left = record.within(WIDER * CALM_HZ[1])
+    assert left is not None
+    return left
+
+
 def test_motion_that_comes_and_goes_is_no_part_of_the_band_that_lasts() -> None:
     for kind, expected in ((".", CALM_HZ[1]), ("B", CALM_HZ[1]), ("W", FAST_HZ[1])):
-        _, high_hz = motion_band_hz([window(1, kind)], lasting=True)
+        lasting = motion_band_hz([window(1, kind)], lasting=True)
+        assert lasting is not None
+        high_hz = lasting[1]
         assert expected * 0.95 < high_hz < expected * 1.15, kind
-    assert motion_band_hz([window(1, "B")])[1] > 40.0
+    blown = motion_band_hz([window(1, "B")])
+    assert blown is not None
+    assert blown[1] > 40.0
 
 
 @pytest.mark.parametrize("wide", [1, 2, 3])
 def test_three_wide_windows_of_eight_widen_nothing_in_any_order(wide: int) -> None:
     narrow, broad = (Record.of(window(1, fast), 0.0) for fast in (".", "W"))
-    assert broad.motion_hz[1] > 3.0 * narrow.motion_hz[1]
+    assert motion(broad)[1] > 3.0 * motion(narrow)[1]
     for order in set(permutations([broad] * wide + [narrow] * (4 - wide))):
         assert common_band(order)[:2] == narrow.motion_hz
     assert common_band([broad] * 7 + [narrow])[:2] == broad.motion_hz
@@ -37,15 +54,22 @@ def test_three_wide_windows_of_eight_widen_nothing_in_any_order(wide: int) -> No
 
 def test_a_blow_that_reaches_down_to_nothing_is_no_lower_end() -> None:
     narrow = Record.of(window(1), 0.0)
-    low_hz, high_hz = narrow.motion_hz
+    low_hz, high_hz = motion(narrow)
     assert common_band([replace(narrow, motion_hz=(0.02, 9.0)), narrow]) == (low_hz, 9.0, 2)
     assert common_band([replace(narrow, motion_hz=(20.0, 40.0)), narrow]) == (low_hz, high_hz, 2)
+
+
+def test_the_lower_end_is_that_of_most_windows_where_more_than_an_octave_is_left() -> None:
+    narrow = Record.of(window(1), 0.0)
+    for most_hz, begins_hz in ((4.0, 4.0), (6.0, 1.0)):
+        lows_hz = [1.0, *[most_hz] * 7]
+        assert common_band([replace(narrow, motion_hz=(low_hz, 10.0)) for low_hz in lows_hz]) == (begins_hz, 10.0, 8)
 
 
 def test_the_record_of_a_narrower_band_is_that_of_its_motion_alone() -> None:
     """The sensor's filter makes the faster motion smaller and later; below 12 Hz it is that of a pure delay."""
     wide = Record.of(window(3, "W"), 0.0)
-    narrow = wide.within(WIDER * CALM_HZ[1])
+    narrow = calm(wide)
     alone = Record.of(window(3), 0.0)  # the same motion below 12 Hz, without the faster one
     slopes = [np.linalg.solve(r.root, r.slopes)[:3].T for r in (wide, narrow, alone)]
     assert np.abs(slopes[0] - slopes[2]).max() > 0.02
@@ -59,8 +83,8 @@ def test_the_record_of_a_narrower_band_is_that_of_its_motion_alone() -> None:
 def test_a_narrower_record_knows_the_present_certificate_of_the_reference() -> None:
     wide = Record.of(window(3, "W"), 0.0)
     one, other = (r.root for r in (
-        wide.with_reference_times(1.02).within(WIDER * CALM_HZ[1]),
-        wide.within(WIDER * CALM_HZ[1]).with_reference_times(1.02),
+        calm(wide.with_reference_times(1.02)),
+        calm(wide).with_reference_times(1.02),
     ))  # fmt: skip
     np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
@@ -68,7 +92,9 @@ def test_a_narrower_record_knows_the_present_certificate_of_the_reference() -> N
 def test_white_noise_of_the_reference_is_as_dense_in_a_narrower_band() -> None:
     rms = 1e-4
     white = np.outer([rms, rms * 2.0 * np.pi * 100.0 / np.sqrt(3.0)], np.ones(3))  # to half of the rate
-    narrow = Record.of(replace(window(3, "W"), reference_noise=white), 0.0).within(WIDER * CALM_HZ[1])
+    narrow = calm(Record.of(replace(window(3, "W"), reference_noise=white), 0.0))
+    assert narrow.reference_noise is not None
+    assert narrow.bands is not None
     u, du = narrow.reference_noise
     np.testing.assert_allclose(u, rms, rtol=0.03)
     np.testing.assert_allclose(du, rms * 2.0 * np.pi * narrow.bands.high_hz[-1] / np.sqrt(3.0), rtol=0.03)

@@ -147,7 +147,7 @@ def test_a_mount_that_leans_is_named_with_its_angle() -> None:
     assert f"A mount that leans by {truth['lean_deg']:.0f} deg does the same" in reasons
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_page_reads_what_the_agent_says_of_held_windows() -> None:
     (line,) = (line for line in WORDS.read_text().splitlines() if line.startswith("const EXPLAINED = /"))
     pattern = (
@@ -162,6 +162,7 @@ def test_the_page_reads_what_the_agent_says_of_held_windows() -> None:
     assert re.fullmatch(pattern, "the window contradicts the calibration") is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("behaviour", ["sound", "drifting", "stepped"])
 def test_u_covers_the_truth(behaviour: Behaviour) -> None:
     results, truth = told(behaviour)
@@ -172,6 +173,7 @@ def test_u_covers_the_truth(behaviour: Behaviour) -> None:
     assert 2 * max(last.standard_uncertainty[:9]) < 0.05 * 26154
 
 
+@pytest.mark.slow
 def test_words_name_an_estimate_by_the_number_that_its_own_gateway_gave_it() -> None:
     results, _ = told("leaning")  # another gateway has the same story, and other numbers
     numbers = {r.sequence for r in results if isinstance(r, Estimate)}
@@ -248,6 +250,7 @@ def test_a_fleet_in_several_processes_is_the_same_fleet(
         assert all(after[name] > before[name] for name in after)
 
 
+@pytest.mark.slow
 def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: Path) -> None:
     with (
         SimulatedFleet(5, 1, 1, [site.endpoint], tmp_path) as fleet,

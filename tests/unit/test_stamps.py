@@ -110,6 +110,7 @@ def drawn_stamps(seed: int) -> tuple[float, float, float, float, float, int]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate_hz", "seconds", "rounding_s", "rounded", "repeated", "seed"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from tests.clamp_windows import ALPHAS_DEG, G_MPS2, Q_TRUE, S_TRUE, TRUTH, Fault
 
 MEAN = np.append(np.eye(3).ravel(), np.zeros(3))
 U = np.append(np.where(np.eye(3).ravel() > 0, 0.05, 0.03), np.full(3, 20.0))
-STILL = replace(Wander.none(), offset_rate_mps2=1e-9)
+STILL = Wander({**Wander.none().values, "offset_rate_mps2": 1e-9})
 DEGREE = np.deg2rad(1.0)
 COLUMN_Y, OTHERS = [1, 4, 7], [0, 2, 3, 5, 6, 8]
 FIXED = Priors(gravity_mps2=0.03, offset_mps2=1e-3, lag_window_s=0.0)
@@ -64,7 +65,7 @@ def test_on_a_clamp_it_gives_what_all_windows_at_once_give(seed: int) -> None:
 
 def test_with_exact_angles_it_is_the_least_squares_of_all_points() -> None:
     points = clamp_points(np.random.default_rng(5), Faults(noise_mps2=0.02), repetitions=2)
-    found = turned(replace(Priors.none(), offset_mps2=1e-9))
+    found = turned(Priors.none().with_values({"offset_mps2": 1e-9}))
     for k, window in enumerate(points.windows):
         found.update(Record.of(window, k * 1e-3))
     basis = np.column_stack([points.a, np.ones(len(points.a))])
@@ -88,7 +89,7 @@ def test_the_stated_uncertainty_covers(runs: int, least: int) -> None:
         )
         S = np.eye(3) * (1 + 0.05 * random.normal(size=3)) + 0.03 * random.normal(size=(3, 3)) * (1 - np.eye(3))
         windows = clamp_points(random, faults, S=S, rate_hz=60.0).windows
-        found = turned(replace(Priors(), gravity_mps2=0.0, reference=0.0, transverse=0.0))
+        found = turned(Priors().with_values({"gravity_mps2": 0.0, "reference": 0.0, "transverse": 0.0}))
         for k, window in enumerate(windows):
             found.update(Record.of(window, k * 1e-3))
         calibration = found.result()
@@ -129,7 +130,9 @@ def test_motion_that_goes_along_is_none_of_the_excited_column() -> None:
 
 @pytest.mark.slow
 def test_a_mean_that_drifts_at_a_fixed_mount_moves_the_offset_alone() -> None:
-    wander = replace(Wander.none(), offset_mps2=0.01, offset_rate_mps2=1e-3, offset_rate_walk_mps2=1e-5)
+    wander = Wander(
+        {**Wander.none().values, "offset_mps2": 0.01, "offset_rate_mps2": 1e-3, "offset_rate_walk_mps2": 1e-5}
+    )
     random, found = np.random.default_rng(3), mounted(wander=wander)
     for k in range(200):
         Q = Q_TRUE + 0.24 * k / 199
@@ -146,7 +149,7 @@ def test_a_mean_that_drifts_at_a_fixed_mount_moves_the_offset_alone() -> None:
 @pytest.mark.one_case
 @pytest.mark.parametrize("windows", [150, 400])
 def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better(windows: int) -> None:
-    random, found = np.random.default_rng(4), mounted(replace(FIXED, reference=1e-3))
+    random, found = np.random.default_rng(4), mounted(FIXED.with_values({"reference": 1e-3}))
     smallest = np.inf
     for k in range(windows):
         found.update(Record.of(building_window(random, reference_error=1.5e-3), k / 24))
@@ -159,7 +162,7 @@ def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better(window
 @pytest.mark.slow
 def test_nor_by_motion_askew_to_its_channels() -> None:
     """Which way it goes was measured by two channels, each with its own error: their ratio is no third standard."""
-    random, found = np.random.default_rng(12), mounted(replace(FIXED, reference=1e-3))
+    random, found = np.random.default_rng(12), mounted(FIXED.with_values({"reference": 1e-3}))
     off = np.array([1.5e-3, -1.0e-3, 0.5e-3])
     for k in range(150):
         way = random.normal(size=3)
@@ -171,8 +174,16 @@ def test_nor_by_motion_askew_to_its_channels() -> None:
 
 
 def test_wandering_never_makes_less_known_than_before_any_data() -> None:
-    walks = {"sensitivity": 0.01, "offset_mps2": 0.1, "offset_rate_mps2": 1e-3, "offset_rate_walk_mps2": 1e-3}
-    random, found = np.random.default_rng(5), mounted(wander=replace(Wander.none(), **walks, tilt_rad=0.01))
+    walks: dict[str, Any] = {
+        "sensitivity": 0.01,
+        "offset_mps2": 0.1,
+        "offset_rate_mps2": 1e-3,
+        "offset_rate_walk_mps2": 1e-3,
+    }
+    random, found = (
+        np.random.default_rng(5),
+        mounted(wander=Wander({**Wander.none().values, **walks, "tilt_rad": 0.01})),
+    )
     found.update(Record.of(building_window(random), 0.0))
     found.update(Record.of(building_window(random), 1e6))
     u = found.result().standard_uncertainty
@@ -184,7 +195,7 @@ def test_wandering_never_makes_less_known_than_before_any_data() -> None:
 def test_temperature_is_told_from_drift() -> None:
     random = np.random.default_rng(6)
     model = TemperatureModel(offset_order=1, sensitivity_order=1, u_offset_mps2=(0.05, 1e-3), u_sensitivity=1e-3)
-    found = mounted(model=model, wander=replace(Wander.none(), offset_mps2=1e-3, offset_rate_mps2=1e-3))
+    found = mounted(model=model, wander=Wander({**Wander.none().values, "offset_mps2": 1e-3, "offset_rate_mps2": 1e-3}))
     per_k, of_S = np.array([0.01, -0.02, 0.005]), np.array([[0.0, 0.0, 2e-4], [3e-4, 5e-4, 0.0], [0.0, 0.0, -4e-4]])
     for k in range(150):
         day = k / 24
@@ -233,7 +244,7 @@ def test_the_innovation_is_chi_squared_and_each_score_normal() -> None:
     scores, statistics, freedom = [], [], 0
     for seed in range(40):
         random = np.random.default_rng(seed)
-        found = mounted(replace(FIXED, offset_mps2=1e-3))
+        found = mounted(FIXED.with_values({"offset_mps2": 1e-3}))
         Q = Q_TRUE + 1e-3 * random.normal(size=(12, 3))
         for k in range(12):
             record = Record.of(building_window(random, level_mps2=(0.1, 0.1, 0.1), Q=Q[k]), k / 24)
@@ -301,7 +312,7 @@ def test_an_operators_calibration_is_where_it_goes_on_from() -> None:
 @pytest.mark.slow
 def test_accepted_again_and_again_it_is_known_no_better() -> None:
     # The reference's 0.1 % is in S: were it met as a new one after each accept, u(S_yy) were 0.03 % after six.
-    random, found = np.random.default_rng(12), mounted(replace(FIXED, reference=1e-3))
+    random, found = np.random.default_rng(12), mounted(FIXED.with_values({"reference": 1e-3}))
     for turn in range(6):
         for k in range(12):
             found.update(Record.of(building_window(random, reference_error=1.5e-3), turn + k / 24))
@@ -322,7 +333,7 @@ def test_a_certificate_of_q_does_not_hide_how_the_mount_leans() -> None:
     scores = []
     for seed in range(20):
         random = np.random.default_rng(seed)
-        found = State(TRUTH, u, replace(FIXED, angle_rad=0.2 * DEGREE), STILL, TemperatureModel(), fixed=True)
+        found = State(TRUTH, u, FIXED.with_values({"angle_rad": 0.2 * DEGREE}), STILL, TemperatureModel(), fixed=True)
         leaning = GRAVITY + np.cross(0.2 * DEGREE * random.normal(size=3), GRAVITY)
         found.update(Record.of(building_window(random, gravity_mps2=leaning), 0.0))
         now = found.result()
@@ -350,7 +361,9 @@ def test_truth_is_what_the_tests_take_it_for() -> None:
 
 
 def test_the_law_of_a_later_day_has_wandered_on_and_changes_nothing() -> None:
-    found = turned(Priors(), replace(Wander.none(), sensitivity=0.001, offset_mps2=0.01, offset_rate_mps2=0.004))
+    found = turned(
+        Priors(), Wander({**Wander.none().values, "sensitivity": 0.001, "offset_mps2": 0.01, "offset_rate_mps2": 0.004})
+    )
     for k, window in enumerate(clamp_points(np.random.default_rng(3)).windows):
         found.update(Record.of(window, k * 1e-3))
     before = found.snapshot()

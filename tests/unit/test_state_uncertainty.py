@@ -36,7 +36,7 @@ def state(
     priors: Mapping[str, float], *, fixed: bool = False, walks: Mapping[str, float] | None = None, unit: float = 1.0
 ) -> State:
     stated = Priors.none().with_values(priors)
-    made = State(unit * MEAN, unit * U, stated, Wander(STILL | (walks or {})), TemperatureModel(), fixed=fixed)
+    made = State(unit * MEAN, unit * U, stated, Wander({**STILL, **(walks or {})}), TemperatureModel(), fixed=fixed)
     made.meet("A")
     return made
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from agent.core.events import WindowReport
 from benchmarks.online import bench
 from benchmarks.online.clamp import bench_events
 from benchmarks.online.runner import Run
@@ -101,5 +102,5 @@ def test_the_agent_refuses_the_window_in_which_the_clamp_slips(theta_deg: float,
     for made, taken in ((slipping, False), (world, True)):
         run = Run(bench.config(made, positions=[], poses=poses))
         recorded = made.recording(p.schedule.start_s + bench.HOLD_S + bench.AFTER_S)
-        said = [r for event in bench_events(made, recorded) for r in run.feed(event) if r.what == "window"]
+        said = [r for event in bench_events(made, recorded) for r in run.feed(event) if isinstance(r, WindowReport)]
         assert [window.used for window in said] == [taken]

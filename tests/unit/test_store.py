@@ -16,7 +16,8 @@ import pytest
 from agent.core.events import CalibrationUpdate, StatusChange
 from agent.core.memory import MOST_MEMORIES, Memory
 from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
-from agent.delivery.store import UNKEPT_MAX, WAITING_MAX, Store
+from agent.delivery.store import WAITING_MAX, Store
+from agent.recording.continuation import UNKEPT_MAX
 
 
 def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: object) -> StoredResult:

@@ -9,7 +9,8 @@ import pytest
 
 from agent.core.events import Result
 from agent.delivery.history import FILE_NAME, History, StoredResult
-from agent.delivery.store import UNKEPT_MAX, Store
+from agent.delivery.store import Store
+from agent.recording.continuation import UNKEPT_MAX
 from agent.recording.files import RecordingFile, recordings
 from agent.recording.scan import scan
 from agent.recording.writer import Recorder

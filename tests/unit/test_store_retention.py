@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ from tests.unit.test_store import record, sequences, status
 NOW_NS = 1_800_000_000 * 1_000_000_000
 
 
-def results(first: int, count: int, age_days: float, what: str = "window", **fields: object) -> list[StoredResult]:
+def results(first: int, count: int, age_days: float, what: str = "window", **fields: Any) -> list[StoredResult]:
     t_utc_ns = NOW_NS - int(age_days * DAY_NS)
     return [record(n, what, t_utc_ns=t_utc_ns, **fields) for n in range(first, first + count)]
 

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from agent.core.events import Result, StatusChange
 from agent.core.raw_watch import RawWatch
@@ -33,7 +34,7 @@ def recording(coarse: bool) -> Recording:
 def held(axes: list[int], since_s: float = SINCE_S, value: float | None = None) -> Callable[[Array, Array], None]:
     def change(t: Array, V: Array) -> None:
         late = t >= since_s
-        V[np.ix_(late, axes)] = V[late][0][axes] if value is None else value
+        V[np.ix_(np.flatnonzero(late), np.array(axes))] = V[late][0][axes] if value is None else value
 
     return change
 
@@ -98,7 +99,7 @@ def test_a_quiet_sensor_of_12_bits_is_not_called_stuck(motion: str, noise: float
     assert alarms(1, 0.1, MOTIONS[motion], noise) == []
 
 
-def watched(x: Array, bursts: int = BURST) -> Iterator[tuple[list[str], Array]]:
+def watched(x: Array, bursts: int = BURST) -> Iterator[tuple[list[str], NDArray[np.bool_]]]:
     """Samples (n, 3) of a device, one block of 1 s after the other: what is told after each, and which outputs (3,) of
     it are marked in the corrected stream."""
     watch, stream, size = RawWatch(600.0), DeviceStream("s", 0), round(RATE_HZ)
@@ -115,7 +116,7 @@ def fed(x: Array, bursts: int = BURST) -> list[str]:
     return [text for said, _ in watched(x, bursts) for text in said]
 
 
-def marked(x: Array) -> Array:
+def marked(x: Array) -> NDArray[np.bool_]:
     """(n, 3) the outputs that are marked, of each block."""
     return np.array([suspect for _, suspect in watched(x)])
 
@@ -159,7 +160,7 @@ def test_bits_that_are_read_wrongly_are_told() -> None:
         "s: single samples are off by a power of two (a bit is read wrongly: check cable and bus), 1"
     )
     wrong = (np.abs(flipped - sound) > 2.0**12).reshape(-1, 100, 3).any(axis=1)  # larger than anything in the noise
-    assert marked(flipped)[60:][wrong[60:]].mean() > 0.9
+    assert marked(flipped)[60:][np.asarray(wrong)[60:]].mean() > 0.9
     assert not marked(sound).any()
     knocks = np.where(at, sound + 10.0 ** random.uniform(4.0, 5.7, sound.shape), sound)
     assert fed(knocks) == fed(sound) == []

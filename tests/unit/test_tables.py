@@ -57,7 +57,7 @@ def test_a_file_of_many_chunks_is_the_same(tmp_path: Path, monkeypatch: pytest.M
     rows = grid(3000)
     path = write(tmp_path, HEADER + body(rows[:1500]) + body(rows[1500:], "%.8e"))
     monkeypatch.setattr(lines, "CHUNK_BYTES", 1000)
-    seen = []
+    seen = list[int]()
     table = read_sensor(path, seen.append)
     np.testing.assert_allclose(np.column_stack([table.time_s[:], table.v[:]]), rows, rtol=1e-9, atol=1e-9)
     assert sum(seen) == path.stat().st_size

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,7 @@ def window(ellipse: Array, seed: int, lag_s: float = 0.0, start_s: float = 0.0, 
     u, du = (x + sd * random.normal(size=x.shape) for x, sd in zip((a, da), noise, strict=True))
     V = felt @ S.T + [0.1, -0.2, 9.81] + OF_SENSOR * random.normal(size=a.shape)
     sums = window_sums(u, du, V, np.arange(0, N + 1, 50))
-    kind = "motion" if size_mps2 else "rest"
+    kind: Literal["motion", "rest"] = "motion" if size_mps2 else "rest"
     return Window(
         start_s, start_s + N / RATE_HZ, beside(np.eye(3)), sums, True, "", N, 0, kind,
         reference_noise=np.repeat(noise[:, None], 3, axis=1),

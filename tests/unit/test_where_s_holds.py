@@ -121,7 +121,8 @@ def test_two_tones_tell_s_at_their_mean_frequency_by_power() -> None:
     frequency may lie far outside of them (here 10.3 Hz)."""
     random = np.random.default_rng(37)
     t = np.arange(6000) / RATE_HZ
-    a = sum(1.5 * np.sin(2.0 * np.pi * hz * t[:, None] + random.uniform(0.0, 6.28, 3)) for hz in (6.4, 8.3))
+    tones = [1.5 * np.sin(2.0 * np.pi * hz * t[:, None] + random.uniform(0.0, 6.28, 3)) for hz in (6.4, 8.3)]
+    a = tones[0] + tones[1]
     V, u = (x + 0.02 * random.normal(size=a.shape) for x in (a, a))
     found = calibrate((t, V), {"time_s": t, "ax": u[:, 0], "ay": u[:, 1], "az": u[:, 2]}, rotation=np.eye(3))
     assert found.reference_frequency_hz == pytest.approx(np.sqrt((6.4**2 + 8.3**2) / 2.0), rel=0.02)

@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import zenoh
 
+from agent.core.events import Result
 from agent.delivery.consumer import Consumer, Received
 from agent.delivery.history import StoredResult
 from agent.delivery.router import open_router
@@ -48,7 +49,9 @@ class Site:
 
 def record(sequence: int, what: str = "window", sensor: str = "mems", **fields: Any) -> StoredResult:
     """A result; `fields` are added to its payload."""
-    whole = {"window": window, "calibration": calibration, "status": status, "clock": clock}[what](sequence)
+    makers: dict[str, Callable[[int], Result]]
+    makers = {"window": window, "calibration": calibration, "status": status, "clock": clock}
+    whole = makers[what](sequence)
     payload = {**msgspec.structs.asdict(whole), "sensor": sensor, "recorded": True, **fields}
     return StoredResult(sequence, "run-1", sensor, what, msgspec.json.encode(payload), 1000 + sequence, True, "f.mcap")
 
