@@ -59,12 +59,11 @@ class SelfTestPlan(Section):
     default that of a regulator whose maker states 2 % over load, line and temperature.
     """
 
-    at: Annotated[time, Field(description="time of day in UTC, such as \"03:00\"; when little moves")]
+    at: Annotated[time, Field(description='time of day in UTC, such as "03:00"; when little moves')]
     most_motion_mps2: Annotated[
         Positive,
-        Field(description="standard deviation of 10 s of samples, above which the sensor does not test itself; it waits "
-              "for less until an hour has passed"),
-    ] = 0.1  # fmt: skip
+        Field(description="standard deviation of 10 s of samples above which it waits, for an hour at most"),
+    ] = 0.1
     u_supply_pct: Annotated[float, Field(ge=0, le=10)] = 1.0
 
     @field_validator("at")
@@ -120,7 +119,7 @@ class Channel(Knowledge):
     ] = ()
     clamp_theta_deg: Annotated[float | None, Field(ge=-90, le=90)] = None
 
-    # Off unless it is stated, also without a reference: only people know when little moves, and whether samples may lack.
+    # Off unless stated, also without a reference: only people know when little moves, and whether samples may lack.
     self_test: SelfTestPlan | None = None
 
     @property

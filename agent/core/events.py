@@ -401,7 +401,7 @@ class SelfTestReport(Result, frozen=True, kw_only=True):
     `response_mps2` (3,): change of the mean of x, y, z by the self-test, over the sensitivity of the data sheet, so
     that no calibration moves it; `u_response_mps2` from the scatter of `pairs` of phases with and without it; NaN where
     it did not run. `u_supply_pct` (3,): standard uncertainty of the response by the supply voltage, which nobody
-    measures and which all axes share. `motion_mps2` (3,): standard deviation of the samples before. `faults`: of what is
+    measures and which all axes share. `motion_mps2` (3,): standard deviation of the samples before. `faults`: what is
     beyond the limits of the maker.
     """
 

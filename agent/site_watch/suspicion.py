@@ -151,7 +151,7 @@ def sentence(told: SensorVerdict) -> str:
 
 
 def _heard(one: Witness) -> str:
-    name = "the structure" if one.name == "structure" else one.name
+    name = f"the {one.name}" if one.name in ("structure", "self-test") else one.name
     if one.says == "silent":
         return f"{name} is silent"
     if one.says == "contradicts":

@@ -1,6 +1,6 @@
-"""What else than the structure says of a change: gravity (the mean of each output) and the noise floor.
+"""What else than the structure says of a change: gravity (the mean of each output), the noise floor, the self-test.
 
-Both are asked at the date that the structure has told, so no date is sought. A change of the sensitivity of an axis
+All are asked at the date that the structure has told, so no date is sought. A change of the sensitivity of an axis
 by s changes its mean by s times the mean, since gravity is always there; a turn changes the means as it changes any
 acceleration. A witness that could not see a change of this size is silent.
 """
@@ -16,6 +16,7 @@ from calib.site_watch.together import DIRECTIONS
 
 AGREES = 2.0  # standard uncertainties within which two sizes agree, and below which a size cannot be seen
 LEAST_NOISE = 3.0  # standard uncertainties from which the noise floor has changed, at a date that others tell
+LEAST_U_RESPONSE = 1e-4  # of a change of the log of a response, however little it scatters
 LEAST_U_MPS2 = 1e-5  # of a change of the mean, however steady it is: no output is read that exactly
 TURNS = 3  # index in theta of the first turn
 
@@ -67,6 +68,28 @@ def noise(direction: int, step: Array, u_step: Array) -> Witness:
         return Witness("noise", "silent")
     factor = float(np.exp(step[best]))
     return Witness("noise", "agrees", factor - 1.0, factor * float(u_step[best]))
+
+
+def self_test(direction: int, size: float, step: Array, u_step: Array, u_supply: Array) -> Witness:
+    """The self-test on a change of `size` in DIRECTIONS[direction].
+
+    `step`, `u_step` (3,): how the log of the response of x, y, z changed at the date; `u_supply` (3,): by the supply,
+    of one sign in all axes. So a change of one axis is seen beside the others however the supply has changed, and one
+    of all three only beyond it. How much of a change of the sensitivity the response shows is not known of any part:
+    it agrees where it has changed with the same sign at all, and tells its own size.
+    """
+    theta = DIRECTIONS[direction][:TURNS]
+    known = np.isfinite(u_step) & np.isfinite(u_supply)
+    theta, supply = theta[known], u_supply[known]
+    if not theta.any():
+        return Witness("self-test", "silent")
+    variance = np.diag(np.square(np.maximum(u_step[known], LEAST_U_RESPONSE))) + np.outer(supply, supply)
+    weight = np.linalg.solve(variance, theta)
+    information = float(weight @ theta)
+    if information * size**2 < AGREES**2:
+        return Witness("self-test", "silent")
+    told, u_told = float(weight @ step[known]) / information, information**-0.5
+    return Witness("self-test", "agrees" if told * np.sign(size) >= AGREES * u_told else "contradicts", told, u_told)
 
 
 def _turned(turn: Array, mean: Array) -> Array:

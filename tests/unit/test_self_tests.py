@@ -1,4 +1,4 @@
-"""The self-test of a device each night: the reader runs it, the core says what it shows, nothing takes it for motion."""
+"""The self-test of a device each night: the reader runs it, the core says what it shows, no window sees it."""
 
 from __future__ import annotations
 
