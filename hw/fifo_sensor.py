@@ -247,7 +247,9 @@ class FifoSensor(PollingSensor):
             self.open()
         test = self._self_test()
         self._switch(test.before)
-        off = [(register, self._held[register][1]) for register, _ in test.writes]
+        # Off by the same writes, which may change the mode meanwhile, with each register at last as it is now.
+        last = {register: k for k, (register, _) in enumerate(test.writes)}
+        off = [(r, self._held[r][1] if last[r] == k else value) for k, (r, value) in enumerate(test.writes)]
         self._self_test_writes = {True: test.writes, False: off}
         self._settle_s = test.settle_s
         return test

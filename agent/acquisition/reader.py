@@ -13,20 +13,16 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from math import nan
 from typing import Any, TypeVar
 
-import numpy as np
-
-from agent.acquisition.self_testing import PAIRS, SelfTesting
+from agent.acquisition.self_testing import SelfTesting, shown_by
 from agent.config.channel import SelfTestPlan
 from agent.config.devices import Device
 from agent.core.events import IN_DRIVER, DeviceChange, Event, Gap, SelfTestRun
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 from hw.promises import BlockCheck, checked_drops, checked_info, driver_of, told_as, words
-from hw.self_test import SelfTestingSensor, SelfTestPhase
+from hw.self_test import SelfTestingSensor
 from hw.sensor import AdapterError, ConfigurationError, DeviceError, DeviceLost, Sensor, load_driver, system_clock
-from hw.units import STANDARD_GRAVITY_MPS2
 
 BLOCKS_A_SECOND = 2
 QUEUE_S = 30  # s of blocks of every device that the queue can hold
@@ -229,32 +225,13 @@ class Reader(threading.Thread):
             return False
         self._report_self_test("begun", motion_mps2=motion)
         try:
-            shown = self._phases(sensor)
+            shown = shown_by(sensor, self._within, self._stop_request.is_set)
         except BaseException as error:
             self._report_self_test("failed", motion_mps2=motion, message=told_as(error))
             raise
         if shown:
             self._report_self_test("done", motion_mps2=motion, **shown)
         return True
-
-    def _phases(self, sensor: SelfTestingSensor) -> dict[str, Any]:
-        """What the self-test shows, as in SelfTestRun; nothing where the run ends."""
-        test = self._within(sensor.begin_self_test)
-        phases: list[SelfTestPhase] = []
-        for number in range(2 * PAIRS + 1):
-            if self._stop_request.is_set():
-                return {}
-            phases.append(self._within(sensor.self_test_phase, on=number % 2 == 1))
-        self._within(sensor.take_drops)  # nothing that lacks in the phases is a sample
-        means = STANDARD_GRAVITY_MPS2 * np.array([phase.mean_g for phase in phases])
-        degrees = [phase.temperature_degc for phase in phases if phase.temperature_degc is not None]
-        return {
-            "off_mps2": means[::2].ravel().tolist(), "on_mps2": means[1::2].ravel().tolist(),
-            "low_mps2": [STANDARD_GRAVITY_MPS2 * g for g in test.low_g],
-            "high_mps2": [STANDARD_GRAVITY_MPS2 * g for g in test.high_g],
-            "supply_exponent": list(test.supply_exponent),
-            "temperature_degc": float(np.mean(degrees)) if degrees else nan,
-        }  # fmt: skip
 
     def _report_self_test(self, state: Any, **shown: Any) -> None:
         now_ns, utc_ns = time.monotonic_ns(), time.time_ns()

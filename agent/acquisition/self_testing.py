@@ -4,19 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from typing import Literal
+from math import nan
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
 from agent.config.channel import SelfTestPlan
 from calib.model import Array
 from hw.block import SampleBlock
+from hw.self_test import SelfTestingSensor, SelfTestPhase
+from hw.units import STANDARD_GRAVITY_MPS2
 
 PAIRS = 6  # of phases without and with the self-test
 LOOK_S = 10.0  # of samples that show how much moves
 WITHIN = timedelta(hours=1)  # after the stated time, in which a moment with little motion is waited for
 
+T = TypeVar("T")
 Answer = Literal["wait", "test", "skip"]
+
+
+class Caller(Protocol):
+    """Calls a method of a driver."""
+
+    def __call__(self, method: Callable[..., T], **arguments: Any) -> T:
+        """What the method returns."""
 
 
 class SelfTesting:
@@ -68,3 +79,26 @@ class SelfTesting:
         now = self._now_utc()
         today = datetime.combine(now.date(), self._plan.at, UTC)
         return today if today > now else today + timedelta(days=1)
+
+
+def shown_by(sensor: SelfTestingSensor, call: Caller, stopped: Callable[[], bool]) -> dict[str, Any]:
+    """What the self-test of an open device shows, as fields of SelfTestRun; nothing where `stopped` says so meanwhile.
+
+    Raises what the driver raises. The device has to be opened again.
+    """
+    test = call(sensor.begin_self_test)
+    phases: list[SelfTestPhase] = []
+    for number in range(2 * PAIRS + 1):
+        if stopped():
+            return {}
+        phases.append(call(sensor.self_test_phase, on=number % 2 == 1))
+    call(sensor.take_drops)  # nothing that lacks in the phases is a sample
+    means = STANDARD_GRAVITY_MPS2 * np.array([phase.mean_g for phase in phases])
+    degrees = [phase.temperature_degc for phase in phases if phase.temperature_degc is not None]
+    return {
+        "off_mps2": means[::2].ravel().tolist(), "on_mps2": means[1::2].ravel().tolist(),
+        "low_mps2": [STANDARD_GRAVITY_MPS2 * g for g in test.low_g],
+        "high_mps2": [STANDARD_GRAVITY_MPS2 * g for g in test.high_g],
+        "supply_exponent": list(test.supply_exponent),
+        "temperature_degc": float(np.mean(degrees)) if degrees else nan,
+    }  # fmt: skip

@@ -136,7 +136,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
         site = _structure(tests, sensors)
         if known_u is not None and anchored.any():
             common = _common_change(tests, known_u[anchored], anchored)
-        sensors = [_witnessed(watch, i, told) for i, told in enumerate(sensors)]
+        sensors = [witnessed(watch, i, told) for i, told in enumerate(sensors)]
         month = int(np.argmin([abs(watch.day - begin + 1 - MONTH_DAYS) for begin in tests.begins]))
         least = limit * tests.joint.u[month, :, :3]
     common = common or _common_by_visits(watch)
@@ -216,8 +216,8 @@ def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorV
     return noise
 
 
-def _witnessed(watch: SiteWatch, i: int, told: SensorVerdict) -> SensorVerdict:
-    """The verdict with what each witness says of it at its date."""
+def witnessed(watch: SiteWatch, i: int, told: SensorVerdict) -> SensorVerdict:
+    """The verdict of sensor `i` with what each witness says of it at its date."""
     if told.kind not in ("sensitivity", "turn"):
         return told
     k, u = watch.means.begins.index(told.since), told.U / COVERAGE
@@ -228,7 +228,7 @@ def _witnessed(watch: SiteWatch, i: int, told: SensorVerdict) -> SensorVerdict:
     others = gravity(told.direction, told.size, u, mean, step, u_step), noise(told.direction, floor, u_floor)
     if watch.self_tests.days.reshape(-1, 3)[i].any():
         shown, u_shown = (part[0, i] for part in _followed(watch, watch.self_tests, watch.self_test_scatter, [k]))
-        others = *others, self_test(told.direction, told.size, shown, u_shown, watch.u_supply[i])
+        others = *others, self_test(told.direction, told.size, u, shown, u_shown, watch.u_supply[i])
     return replace(told, witnesses=(Witness("structure", "agrees", told.size, u), *others))
 
 

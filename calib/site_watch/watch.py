@@ -16,6 +16,7 @@ from calib.site_watch.day import Day, SelfTests, Visits
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import HUBER, PRIOR_DEGREES, TERMS, Steps
 from calib.site_watch.together import DIRECTIONS, biweight, design, scores
+from calib.site_watch.witnesses import supply_basis
 
 ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
 FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, or its residual to count
@@ -163,16 +164,20 @@ class SiteWatch:
         self.days_scatter.update(score / np.sqrt(np.where(known, squares, 1.0)), known)
 
     def _take_self_tests(self, day: Day, visited: NDArray[np.bool_]) -> None:
-        """Responses are followed at the temperature of their night, or at that of the site where the device tells
-        none, as noise floors are, with its square."""
+        """Responses are followed along and across what the supply does to them, at the temperature of their night, or
+        at that of the site where the device tells none. A night counts where all three axes are told."""
         none = np.full((self.shape[0], 3), np.nan)
         tests = day.self_tests or SelfTests(none, none, none, none[:, 0])
-        there = np.isfinite(tests.log_response + tests.u) & ~visited[:, None]
+        there = (
+            np.isfinite(tests.log_response + tests.u + tests.u_supply).all(axis=1, keepdims=True) & ~visited[:, None]
+        )
         self.u_supply = np.where(there, tests.u_supply, self.u_supply)
+        basis = supply_basis(self.u_supply)
+        response = np.where(there, np.einsum("nij,nj->ni", basis, tests.log_response), np.nan)
+        u = np.sqrt(U_SELF_TEST**2 + np.einsum("nij,nj->ni", basis**2, tests.u**2))
         own = tests.temperature_degc
         degc = np.where(np.isfinite(own), own, day.temperature_degc)
-        told, u = np.where(there, tests.log_response, np.nan), np.hypot(U_SELF_TEST, tests.u)
-        self._follow(self.self_tests, self.self_test_scatter, told, u, degc, squared=True)
+        self._follow(self.self_tests, self.self_test_scatter, response, u, degc, squared=True)
 
     def _follow(
         self, steps: Steps, scatter: Blocks, told: Array, u: Array, degc: Array, *, squared: bool = False
