@@ -49,7 +49,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "--corrected",
     is_flag=True,
-    help="Accelerations by S(t) and Q(t), smoothed over the past: by all windows up to the end of the recordings.",
+    help="Accelerations by S(t) and Q(t), smoothed over the past: by all windows up to the end of the recordings, or "
+    "without a reference by the calibrations before and after.",
 )
 @click.option(
     "--place",
@@ -60,7 +61,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @click.option(
     "--site-verdicts", type=_FILE, metavar="FILE",
-    help="What `fieldcal fleet watch --json FILE` tells: U then holds a change that is suspected of the device.",
+    help="What `fieldcal fleet watch --json FILE` tells: U then holds a change that is suspected of the device; with "
+    "--corrected it comes at its date.",
 )  # fmt: skip
 @DATA_DIR
 def export(
@@ -72,8 +74,9 @@ def export(
     A sensor has its indications and, where it was calibrated, accelerations by the newest calibration. With --corrected
     they are those by S and Q at the time of each sample, by all windows before and after it, and each sample has the
     number of the calibration that was in force then; the head of the file says what the smoothing follows from. The
-    windows are those up to the end of the recordings, or with --data-dir all that the agent has kept. With the ending
-    .xml the epochs of S and Q themselves are written, as StationXML for the channels that .mseed has.
+    windows are those up to the end of the recordings, or with --data-dir all that the agent has kept. A sensor without
+    a reference has S and Q between its calibrations, with the step that --site-verdicts tells at its date. With the
+    ending .xml the epochs of S and Q themselves are written, as StationXML for the channels that .mseed has.
 
     Exit status 0 if the files are written, 2 on bad input.
     """

@@ -137,6 +137,7 @@ def test_of_results_that_tell_a_calibration_again_the_first_is_used() -> None:
     assert told["between 2023-11-14T00:00:00Z and 2024-02-22T00:00:00Z"].startswith("on a line, U 1")
 
 
+@pytest.mark.slow
 def test_the_export_of_a_watched_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two configurations state the calibrations of two visits; the data directory has both."""
     S = np.array(PRIOR["sensitivity"]).reshape(3, 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -151,6 +152,7 @@ def test_one_sensor_is_named_with_size_and_date(learned: tuple[Site, SiteWatch])
     assert told.what == "sensitivity of z"
     assert abs(told.size + 0.01) < told.U < 0.006
     assert told.earliest <= 20_060 <= told.latest
+    assert abs(told.since - 20_060) <= 2
     assert not found.gateways
 
 
@@ -258,7 +260,10 @@ def test_sound_sites_are_left_alone() -> None:
 
 
 def test_the_limit_grows_with_the_number_of_tests() -> None:
-    assert 4.0 < limit_of(8, 3) < limit_of(30, 5) < limit_of(200, 10) < 5.5
+    """Of each sensor seven directions, three noise floors and its bands; half an alarm a year in 1,000 looks at each."""
+    for sensors, gateways in ((8, 3), (30, 5), (200, 10)):
+        tests = 11 * sensors + gateways
+        assert limit_of(sensors, gateways) == pytest.approx(NormalDist().inv_cdf(1.0 - 0.25 / (1000.0 * tests)))
 
 
 def test_a_watch_goes_on_from_its_snapshot_bit_for_bit() -> None:
