@@ -17,6 +17,7 @@ from agent.core.events import RunStart, SelfTestReport, Tick, WatchReport
 from agent.recording.writer import Recorder
 from agent.site_watch.day_sum import days_of
 from agent.site_watch.files import from_files
+from agent.site_watch.hour import TWICE
 from tests.unit.mounted_site import site_config
 
 HOUR_NS = 3_600_000_000_000
@@ -94,6 +95,7 @@ def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, cl
     assert again.exception is None
     after = json.loads(again.stdout)
     assert sum(after["left_out"].values()) == 15
+    assert after["left_out"][TWICE] == 1, "all others are refused by themselves"
     assert after["lines"] == len(hostile)
     by_name = {one["sensor"]: one for one in after["sensors"]}
     for one in found["sensors"]:

@@ -260,7 +260,7 @@ def test_sound_sites_are_left_alone() -> None:
 
 
 def test_the_limit_grows_with_the_number_of_tests() -> None:
-    """Of each sensor seven directions, three noise floors and its bands; half an alarm a year in 1,000 looks at each."""
+    """Of a sensor seven directions, three noise floors and its bands; half an alarm a year in 1,000 looks at each."""
     for sensors, gateways in ((8, 3), (30, 5), (200, 10)):
         tests = 11 * sensors + gateways
         assert limit_of(sensors, gateways) == pytest.approx(NormalDist().inv_cdf(1.0 - 0.25 / (1000.0 * tests)))
@@ -425,8 +425,8 @@ def test_the_self_test_is_asked_at_the_date_of_the_change_at_the_temperature_of_
     learned: tuple[Site, SiteWatch],
 ) -> None:
     """x of sensors 4 and 6 loses 3 %; the response of sensor 4 with it. All responses follow the temperature of their
-    night by 0.2 %/K with curvature, and the supply by 1 % from night to night; that of sensor 6 falls by 4 % at the
-    same date. Sensor 2 has none, and sensor 6 has not every night.
+    night by 0.2 %/K, each axis otherwise, and the supply by 1 % from night to night; that of sensor 6 falls by 4 % at
+    the same date. Sensor 2 has none, and sensor 6 has not every night.
     """
     site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
     random = np.random.default_rng(5)
@@ -434,7 +434,8 @@ def test_the_self_test_is_asked_at_the_date_of_the_change_at_the_temperature_of_
     for k in range(40):
         day = site.day(change if k >= 28 else None)
         T = (15.0 + random.normal(0.0, 6.0, 9) - 10.0) / 10.0
-        shown = 1.0 + (0.02 * T + 0.005 * T**2)[:, None] + random.normal(0.0, 0.001, (9, 3))
+        warmed = np.outer(T, [0.02, -0.02, 0.01]) + np.outer(T**2, [0.03, 0.0, -0.03])
+        shown = 1.0 + warmed + random.normal(0.0, 0.001, (9, 3))
         shown += random.normal(0.0, 0.02, (9, 1))
         if k >= 28:
             shown[4, 0] -= 0.03
