@@ -222,6 +222,9 @@ def test_a_damaged_day_and_a_damaged_hour_are_left_out(tmp_path: Path, rows: lis
         found = list(source_of(database.query, "bridge", closed=True).sums())
         assert [one.number - FIRST_H // 24 for one in found] == [0, 2]
         assert [len(one.sensors) for one in found] == [5, 6]
+        short = msgspec.msgpack.encode(msgspec.structs.replace(found[1], value=found[1].value[:-4]))
+        database.query("UPDATE watch_day SET payload = :p WHERE day = :d", p=short, d=FIRST_H // 24 + 2)
+        assert len(list(source_of(database.query, "bridge", closed=True).sums())) == 1
 
 
 def test_what_a_database_is_not(tmp_path: Path, rows: list[dict[str, Any]]) -> None:

@@ -234,9 +234,11 @@ def test_utc_that_steps_back_a_little_opens_no_hour_twice_and_a_wrong_year_does_
     world = World(t_s=0.0)
     blocks = [world.block() for _ in range(600)]
     second = SECOND
-    steps = [replace(b, t_utc_ns=b.t_utc_ns - (5 * second if k > 200 else 0)) for k, b in enumerate(blocks)]
+    begun = next(k for k, b in enumerate(blocks) if (b.t_utc_ns - 20 * second) // HOUR_NS > EPOCH_NS // HOUR_NS)
+    steps = [replace(b, t_utc_ns=b.t_utc_ns - (30 * second if k > begun else 0)) for k, b in enumerate(blocks)]
+    assert (steps[begun + 1].t_utc_ns - 20 * second) // HOUR_NS == EPOCH_NS // HOUR_NS, "back into the hour before"
     numbers = [r.hour_utc_ns for r in hours(run(watched_config(prior=PRIOR), steps)[1])]
-    assert len(set(numbers)) == len(numbers)
+    assert len(set(numbers)) == len(numbers) >= 3
     year = 365 * 86400 * second
     wrong = [replace(b, t_utc_ns=b.t_utc_ns + (year if k < 100 else 0)) for k, b in enumerate(blocks)]
     numbers = [r.hour_utc_ns for r in hours(run(watched_config(prior=PRIOR), wrong)[1])]
