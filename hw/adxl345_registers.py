@@ -12,6 +12,7 @@ pull request 5837; paparazzi, imu_ppzuav.h). The part does not tell its supply.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from hw.self_test import SelfTest
@@ -48,6 +49,7 @@ SETTING_NAMES: Mapping[int, str] = {
     FIFO_CTL: "FIFO_CTL",
 }
 _FULL_RESOLUTION, _SELF_TEST = 0x08, 0x80
+_XY_AT_3V3, _Z_AT_3V3 = 1.77, 1.47  # change by the self-test at 3.3 V over that at 2.5 V
 
 
 def limits(range_g: int) -> tuple[int, int]:
@@ -84,13 +86,19 @@ def self_test(range_g: int) -> SelfTest:
     Limits from the data sheet, tables 1 and 14: at 2.5 V supply 0.20 to 2.10 g in x, the same with opposite sign in y,
     0.30 to 3.40 g in z; at 3.3 V these values are multiplied by 1.77 (x, y) and 1.47 (z). The supply voltage is not
     known here, so the limits include both. They hold at 100 to 800 Hz (page 22). The noise is given in counts, at any
-    rate.
+    rate. The power of the supply follows from the factors between 2.5 and 3.3 V.
     """
     return SelfTest(
         writes=((DATA_FORMAT, _SELF_TEST | _FULL_RESOLUTION | RANGE_CODES[range_g]),),
         settle_s=0.1,
-        low_g=(0.20, -2.10 * 1.77, 0.30),
-        high_g=(2.10 * 1.77, -0.20, 3.40 * 1.47),
+        low_g=(0.20, -2.10 * _XY_AT_3V3, 0.30),
+        high_g=(2.10 * _XY_AT_3V3, -0.20, 3.40 * _Z_AT_3V3),
         noise_g=(0.75 / COUNTS_PER_G, 0.75 / COUNTS_PER_G, 1.1 / COUNTS_PER_G),
         source="ADXL345 data sheet, self-test at 2.5 and 3.3 V, noise at 100 Hz",
+        supply_exponent=(_power(_XY_AT_3V3), _power(_XY_AT_3V3), _power(_Z_AT_3V3)),
     )
+
+
+def _power(factor: float) -> float:
+    """The power of the supply with which something grows by `factor` from 2.5 to 3.3 V."""
+    return math.log(factor) / math.log(3.3 / 2.5)

@@ -64,6 +64,11 @@ class FifoOptions(Options):
     bus_khz: float = Field(400.0, gt=0, le=3400, description="clock of the I2C bus as set on this machine")
     spi_mhz: float = Field(1.0, ge=0.1, description="clock with which the driver reads over SPI; slower for long wires")
 
+    @property
+    def tests_itself(self) -> bool:
+        """All these parts have a self-test."""
+        return True
+
     @field_validator("rate_hz")
     @classmethod
     def _known_rate(cls, value: float) -> float:

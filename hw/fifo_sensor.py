@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from hw.block import BlockFlags, DeviceInfo
+from hw.block import BlockFlags, DeviceInfo, SampleBlock
 from hw.bus_device import READS_MAX, BusDevice
 from hw.cutting import Break, Cutter, Stretch
 from hw.fifo import Burst, FifoSamples
@@ -22,7 +21,7 @@ from hw.fifo_options import BUS_SHARE_MAX
 from hw.i2c import I2CDevice
 from hw.pace import Pace
 from hw.polling import PollingSensor
-from hw.self_test import SelfTest, SelfTestReport
+from hw.self_test import SelfTest, SelfTestPhase, SelfTestReport
 from hw.sensor import GOLDEN, ConfigurationError, DeviceError, DeviceLost
 from hw.spi import SpiDevice
 
@@ -65,6 +64,9 @@ class FifoSensor(PollingSensor):
         before, after = self._spoilt_samples()
         self._cutter = Cutter(name, options.rate_hz, *self._limits(), before=before, after=after)
         self._pace = Pace(options.rate_hz)
+        self._stated = options  # a self-test may need a larger range
+        self._self_test_writes: dict[bool, Sequence[tuple[int, int]]] = {}  # that switch it on and off
+        self._settle_s = 0.0  # after these writes
         self._held: Registers = {}  # what must read the same behind each block: settings, and trims as found
         self._bursts: list[Burst] = []
         self._rest = b""
@@ -165,6 +167,7 @@ class FifoSensor(PollingSensor):
     def _stop(self) -> None:
         """Release the bus; the device goes on measuring until the next reset."""
         self._device.close()
+        self._options = self._stated
 
     def _longest_read(self) -> int:
         """Bytes of the samples that one poll usually finds."""
@@ -225,18 +228,39 @@ class FifoSensor(PollingSensor):
         return self._device.used_by()
 
     def self_test(self) -> SelfTestReport:
-        """Run the self-test of the open device; takes about 3 s. Open the device again afterwards.
+        """Run the self-test of the open device once; takes about 3 s. Open the device again afterwards.
 
         Raises the same errors as `open` and `read_block`.
         """
-        options, range_g = self._options, self._self_test_range_g()
-        try:
-            if range_g != options.range_g:
-                self._options = options.model_copy(update={"range_g": range_g})
-                self.open()
-            return self._tested()
-        finally:
-            self._options = options
+        test = self.begin_self_test()
+        off, on = self.self_test_phase(on=False), self.self_test_phase(on=True)
+        self.close()
+        x, y, z = (with_it - without for with_it, without in zip(on.mean_g, off.mean_g, strict=True))
+        return SelfTestReport(test, (x, y, z), off.scatter_g)
+
+    def begin_self_test(self) -> SelfTest:
+        """As in SelfTestingSensor. Until the device is closed its range is the one of the self-test."""
+        range_g = self._self_test_range_g()
+        if range_g != self._options.range_g:
+            self.close()
+            self._options = self._options.model_copy(update={"range_g": range_g})
+            self.open()
+        test = self._self_test()
+        self._switch(test.before)
+        # Off by the same writes, which may change the mode meanwhile, with each register at last as it is now.
+        last = {register: k for k, (register, _) in enumerate(test.writes)}
+        off = [(r, self._held[r][1] if last[r] == k else value) for k, (r, value) in enumerate(test.writes)]
+        self._self_test_writes = {True: test.writes, False: off}
+        self._settle_s = test.settle_s
+        return test
+
+    def self_test_phase(self, *, on: bool) -> SelfTestPhase:
+        """As in SelfTestingSensor."""
+        self._switch(self._self_test_writes[on])
+        block = self._settled(self._settle_s)
+        counts, g = block.indications, self._counts_per_g()
+        mean, scatter = (tuple((part / g).tolist()) for part in (counts.mean(axis=0), counts.std(axis=0)))
+        return SelfTestPhase(mean, scatter, block.temperature_degc)
 
     def _self_test_range_g(self) -> int:
         """The range for the self-test, g: that of the options, or the first above gravity and the largest change."""
@@ -244,17 +268,6 @@ class FifoSensor(PollingSensor):
         above_g = 1.0 + self._self_test().highest_g
         fitting = (range_g for range_g in ranges_g if range_g >= self._options.range_g and range_g > above_g)
         return int(min(fitting, default=max(ranges_g)))
-
-    def _tested(self) -> SelfTestReport:
-        test = self._self_test()
-        g = self._counts_per_g()
-        self._switch(test.before)
-        still = self._settled(test.settle_s if test.before else 0.0)
-        self._switch(test.writes)
-        change = (self._settled(test.settle_s).mean(axis=0) - still.mean(axis=0)) / g
-        noise = still.std(axis=0) / g
-        self.close()
-        return SelfTestReport(test, tuple(change.tolist()), tuple(noise.tolist()))
 
     def _switch(self, writes: Sequence[tuple[int, int]]) -> None:
         """Write settings of the self-test. The samples from now on do not follow those before."""
@@ -264,14 +277,14 @@ class FifoSensor(PollingSensor):
         self._bursts = []
         self._pace.restart()
 
-    def _settled(self, settle_s: float) -> NDArray[np.generic]:
-        """Indications of one block, after the samples of the first `settle_s` and of the block before are discarded."""
+    def _settled(self, settle_s: float) -> SampleBlock:
+        """One block, after the samples of the first `settle_s` and of the block before are discarded."""
         self._sleep(settle_s)
         self.read_block()
         block = self.read_block()
         if block is None:
             raise DeviceLost(f"{self._device.name}: sent no samples during the self-test")
-        return block.indications
+        return block
 
     def _wait(self) -> None:
         now_ns, _ = self._clock()

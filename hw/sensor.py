@@ -63,6 +63,11 @@ class Options(BaseModel):
         return True
 
     @property
+    def tests_itself(self) -> bool:
+        """Whether the driver is a SelfTestingSensor (hw.self_test)."""
+        return False
+
+    @property
     def asked_of_certificate(self) -> str:
         """What the certificate's sensitivity must state where this device is a reference; "" where 1 may be right."""
         return ""

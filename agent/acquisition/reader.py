@@ -15,10 +15,13 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any, TypeVar
 
+from agent.acquisition.self_testing import SelfTesting, shown_by
+from agent.config.channel import SelfTestPlan
 from agent.config.devices import Device
-from agent.core.events import IN_DRIVER, DeviceChange, Event, Gap
+from agent.core.events import IN_DRIVER, DeviceChange, Event, Gap, SelfTestRun
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 from hw.promises import BlockCheck, checked_drops, checked_info, driver_of, told_as, words
+from hw.self_test import SelfTestingSensor
 from hw.sensor import AdapterError, ConfigurationError, DeviceError, DeviceLost, Sensor, load_driver, system_clock
 
 BLOCKS_A_SECOND = 2
@@ -106,11 +109,12 @@ class Reader(threading.Thread):
     each call is timed, so that `watch` can tell of a driver that does not return.
     """
 
-    def __init__(self, name: str, sensor: Sensor, events: EventQueue) -> None:
+    def __init__(self, name: str, sensor: Sensor, events: EventQueue, self_testing: SelfTesting | None = None) -> None:
         super().__init__(name=f"reader-{name}", daemon=True)
         self.device = name
         self.refused = ""  # what the adapter of the bus refuses, as long as no block has come
         self._sensor = sensor
+        self._self_testing = self_testing
         self._driver = driver_of(sensor)
         self._events = events
         self._stop_request = threading.Event()
@@ -172,6 +176,8 @@ class Reader(threading.Thread):
                 told, self._works, self.refused = True, True, ""
                 self._attempt = self._faults = 0
                 self._events.put(self.device, block)
+                if self._tested(block, info):
+                    return  # the device has to be opened again
             if not info.own_clock and (early_s := began_s + SHORTEST_CALL_S - time.monotonic()) > 0:
                 self._stop_request.wait(early_s)  # a driver that does not wait must not take the processor
 
@@ -195,16 +201,42 @@ class Reader(threading.Thread):
                 self._report_drop(1, "blocks", f"{IN_DRIVER}: {told_as(error)}")
             raise
 
-    def _within(self, method: Callable[[], T]) -> T:
+    def _within(self, method: Callable[..., T], **arguments: Any) -> T:
         """Call a method of the driver. Raises DeviceLost where it returned after `watch` told that it does not."""
         self._call = call = (method.__name__, time.monotonic())
         try:
-            result = method()
+            result = method(**arguments)
         finally:
             self._call = None
         if self._hanging is call:
             raise DeviceLost(f"the driver {self._driver} returned from {call[0]}, but after more than {HANGS_S:g} s")
         return result
+
+    def _tested(self, block: SampleBlock, info: DeviceInfo) -> bool:
+        """Let the device test itself, if that is due; whether it did. Raises what the driver raises."""
+        plan, sensor = self._self_testing, self._sensor
+        if plan is None or info.nominal_sensitivity is None or not isinstance(sensor, SelfTestingSensor):
+            return False
+        answer = plan.update(block, info.nominal_sensitivity)
+        motion = plan.motion_mps2.tolist()
+        if answer == "skip":
+            self._report_self_test("skipped", motion_mps2=motion, message=plan.too_much)
+        if answer != "test":
+            return False
+        self._report_self_test("begun", motion_mps2=motion)
+        try:
+            shown = shown_by(sensor, self._within, self._stop_request.is_set)
+        except BaseException as error:
+            self._report_self_test("failed", motion_mps2=motion, message=told_as(error))
+            raise
+        if shown:
+            self._report_self_test("done", motion_mps2=motion, **shown)
+        return True
+
+    def _report_self_test(self, state: Any, **shown: Any) -> None:
+        now_ns, utc_ns = time.monotonic_ns(), time.time_ns()
+        run = SelfTestRun(device=self.device, state=state, t_monotonic_ns=now_ns, t_utc_ns=utc_ns, **shown)
+        self._events.put(self.device, run)
 
     def _report_drop(self, dropped: int, unit: Any, reason: str) -> None:
         now_ns = time.monotonic_ns()
@@ -248,8 +280,8 @@ class Reader(threading.Thread):
         )
 
 
-def reader_of(device: Device, events: EventQueue) -> Reader:
-    """The reader of a device of a configuration that has passed its check.
+def reader_of(device: Device, events: EventQueue, plan: SelfTestPlan | None = None) -> Reader:
+    """The reader of a device of a configuration that has passed its check. `plan` of its self-tests.
 
     Raises ConfigurationError if its driver cannot be made with these options.
     """
@@ -262,4 +294,4 @@ def reader_of(device: Device, events: EventQueue) -> Reader:
     except (Exception, SystemExit) as error:
         told = f"{device.name}: {IN_DRIVER} {device.driver!r}: it cannot be made: {told_as(error)}"
         raise ConfigurationError(told) from error
-    return Reader(device.name, sensor, events)
+    return Reader(device.name, sensor, events, SelfTesting(plan) if plan is not None else None)

@@ -87,7 +87,8 @@ class Service:
         self._recorder = self._new_recorder(signer)
         self._recorder.close_torn()
         events = EventQueue(len(config.devices))
-        readers = [reader_of(device, events) for device in config.devices]
+        plans = {channel.sensor: channel.self_test for channel in config.channels}
+        readers = [reader_of(device, events, plans.get(device.name)) for device in config.devices]
         self._reception = self._command_reception(events)
         self._publisher = self._publication()
         self._mqtt = self._mqtt_publication()

@@ -14,11 +14,14 @@ from agent.cli.rules import check_rules
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
+    from agent.core.events import CalibrationUpdate
+    from agent.export.between_visits import BetweenVisits
     from agent.export.samples import RecordedContent
     from agent.export.smoothing import Smoothed
 
 ENDINGS = (".csv", ".parquet", ".uff", ".mseed")
 NUMBERED = ENDINGS[:2]  # the formats that can name a calibration for each sample
+MOST_CALIBRATIONS = 10_000  # of a sensor, that are asked of a data directory
 EPOCHS = ".xml"  # has no samples
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -46,7 +49,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "--corrected",
     is_flag=True,
-    help="Accelerations by S(t) and Q(t), smoothed over the past: by all windows up to the end of the recordings.",
+    help="Accelerations by S(t) and Q(t), smoothed over the past: by all windows up to the end of the recordings, or "
+    "without a reference by the calibrations before and after.",
 )
 @click.option(
     "--place",
@@ -57,7 +61,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @click.option(
     "--site-verdicts", type=_FILE, metavar="FILE",
-    help="What `fieldcal fleet watch --json FILE` tells: U then holds a change that is suspected of the device.",
+    help="What `fieldcal fleet watch --json FILE` tells: U then holds a change that is suspected of the device; with "
+    "--corrected it comes at its date.",
 )  # fmt: skip
 @DATA_DIR
 def export(
@@ -69,8 +74,9 @@ def export(
     A sensor has its indications and, where it was calibrated, accelerations by the newest calibration. With --corrected
     they are those by S and Q at the time of each sample, by all windows before and after it, and each sample has the
     number of the calibration that was in force then; the head of the file says what the smoothing follows from. The
-    windows are those up to the end of the recordings, or with --data-dir all that the agent has kept. With the ending
-    .xml the epochs of S and Q themselves are written, as StationXML for the channels that .mseed has.
+    windows are those up to the end of the recordings, or with --data-dir all that the agent has kept. A sensor without
+    a reference has S and Q between its calibrations, with the step that --site-verdicts tells at its date. With the
+    ending .xml the epochs of S and Q themselves are written, as StationXML for the channels that .mseed has.
 
     Exit status 0 if the files are written, 2 on bad input.
     """
@@ -81,6 +87,7 @@ def export(
     _check(to, mcap, place, data_dir, site_verdicts, corrected=corrected)
     try:
         content = content_of(recordings, device)
+        told = list(content.calibrations)
         _suspect(recordings, content, site_verdicts)
         if corrected:
             _check_axes(recordings, content)
@@ -88,7 +95,7 @@ def export(
             _write_epochs(recordings, content, to, place, data_dir)
             return 0
         if corrected:
-            content.smoothed = _smoothed(recordings, content, data_dir)
+            content.smoothed = _smoothed(recordings, content, told, data_dir)
         for fault in content.faults:
             say(f"fieldcal export: {fault}", err=True)
         if not (content.calibrations or corrected) and content.axes == 3:
@@ -202,15 +209,29 @@ def _write_epochs(
     say(f"{to}: {count} epochs of {content.device}")
 
 
-def _smoothed(recordings: Sequence[Path], content: RecordedContent, data_dir: Path | None) -> Smoothed:
-    """The past by the states where the recordings end, or by those in a data directory."""
+def _smoothed(
+    recordings: Sequence[Path], content: RecordedContent, told: Sequence[CalibrationUpdate], data_dir: Path | None
+) -> Smoothed | BetweenVisits:
+    """The past by the states where the recordings end, or by those in a data directory; of a sensor without a
+    reference by its calibrations: `told` by the recordings, and those in a data directory. Raises ExportError."""
+    from agent.core.events import CalibrationUpdate
+    from agent.delivery.calibrations import calibrations
     from agent.delivery.history import FILE_NAME, History
     from agent.export.at_the_end import memories_at_the_end
+    from agent.export.between_visits import between_visits
+    from agent.export.samples import ExportError, channel_of
     from agent.export.smoothing import smoothed
 
-    if data_dir is None:
-        memories = memories_at_the_end(recordings)
-    else:
+    channel = channel_of(recordings[-1], content.device)
+    if channel is None or not channel.watched:
+        if data_dir is None:
+            return smoothed(memories_at_the_end(recordings), content.device)
         with History(data_dir / FILE_NAME) as history:
-            memories = history.memories()
-    return smoothed(memories, content.device)
+            return smoothed(history.memories(), content.device)
+    if data_dir is not None:
+        with History(data_dir / FILE_NAME) as history:
+            kept = [record.result for record in calibrations(history, content.device, limit=MOST_CALIBRATIONS)]
+        told = [*told, *(result for result in kept if isinstance(result, CalibrationUpdate))]
+    if not told:
+        raise ExportError(f"{content.device}: has no calibration, so that no sample can be corrected")
+    return between_visits(channel, told, content.suspicion)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import time
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Discriminator, FailFast, Field, Tag, model_validator
+from pydantic import Discriminator, FailFast, Field, Tag, field_validator, model_validator
 
 from agent.config.knowledge import Certificate, Knowledge, Nine, Positive
 from agent.config.pose import PoseInterval, Stop, tell_apart
@@ -48,6 +49,29 @@ class CheckReference(Section):
     device: Name
     certificate: Certificate = Certificate()
     rotation: Nine | None = None
+
+
+class SelfTestPlan(Section):
+    """The self-test of the sensor, each day. Left out, none runs: the sensor sends nothing for about 15 s, and beside a
+    reference its lag is found anew afterwards.
+
+    The supply voltage is not measured. Its relative standard uncertainty from one day to another, `u_supply_pct`, is by
+    default that of a regulator whose maker states 2 % over load, line and temperature.
+    """
+
+    at: Annotated[time, Field(description='time of day in UTC, such as "03:00"; when little moves')]
+    most_motion_mps2: Annotated[
+        Positive,
+        Field(description="standard deviation of 10 s of samples above which it waits, for an hour at most"),
+    ] = 0.1
+    u_supply_pct: Annotated[float, Field(ge=0, le=10)] = 1.0
+
+    @field_validator("at")
+    @classmethod
+    def _is_utc(cls, value: time) -> time:
+        if value.tzinfo is not None:
+            raise ValueError("at is a time of UTC without a zone, such as 03:00")
+        return value
 
 
 class Channel(Knowledge):
@@ -94,6 +118,9 @@ class Channel(Knowledge):
         Discriminator(lambda stated: "free" if isinstance(stated, str) else "stops"),
     ] = ()
     clamp_theta_deg: Annotated[float | None, Field(ge=-90, le=90)] = None
+
+    # Off unless stated, also without a reference: only people know when little moves, and whether samples may lack.
+    self_test: SelfTestPlan | None = None
 
     @property
     def fixed_mount(self) -> bool:

@@ -43,6 +43,7 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
     options = list(_options(raw, faults))
     faults += _unknown_sensitivities(raw, dict(options))
     faults += _uncertified_references(raw, dict(options))
+    faults += _no_self_tests(raw, dict(options))
     faults += _file_faults(raw)
     faults += _misread(raw, (), Config)
     return config, faults
@@ -89,6 +90,14 @@ def _unknown_sensitivities(raw: Mapping[str, Any], options: Mapping[str, Options
         if not options[sensor].tells_sensitivity:
             what = f"is missing: the device {sensor!r} tells none; state it in its unit per m/s2, from its data sheet"
             yield ("channels", i, "prior", "sensitivity"), what
+
+
+def _no_self_tests(raw: Mapping[str, Any], options: Mapping[str, Options]) -> Iterator[Told]:
+    """Channels that state a self-test of a sensor that has none."""
+    for i, channel in enumerate(_entries(raw, "channels")):
+        sensor = str(channel.get("sensor"))
+        if channel.get("self_test") is not None and sensor in options and not options[sensor].tests_itself:
+            yield ("channels", i, "self_test"), f"the driver of {sensor!r} knows no self-test; remove it"
 
 
 def _uncertified_references(raw: Mapping[str, Any], options: Mapping[str, Options]) -> Iterator[Told]:

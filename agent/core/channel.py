@@ -13,7 +13,7 @@ from agent.core.clocks import Clocks
 from agent.core.corrected import accelerations
 from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import DAY_S, Estimation
-from agent.core.events import CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, Tick
+from agent.core.events import CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, SelfTestRun, Tick
 from agent.core.fault import told
 from agent.core.identity import device_of, identity_of, nominal_of
 from agent.core.kept import keep, kept_as, plain, restated, shelved, take_up, update_of
@@ -31,6 +31,7 @@ from agent.core.outcome import (
 )
 from agent.core.references import References
 from agent.core.run_time import RunTime
+from agent.core.self_tests import SelfTestWatch, self_test_report
 from agent.core.streams import JudgedWindow, Streams
 from agent.core.watch import Hour, SensorWatch
 from agent.core.watched import (
@@ -72,7 +73,7 @@ class ChannelState:
         self._first_day = 0.0  # days that the estimation had counted when this run began
         self._status = ""  # no status was published yet
         self._refused = 0  # how many windows in a row were refused
-        self._clocks, self._time = Clocks(), RunTime()
+        self._clocks, self._time, self._self_tests = Clocks(), RunTime(), SelfTestWatch()
         self._watched, self._means = (SensorWatch() if channel.watched else None), MeanWatch()
 
     def begin(self, origin_ns: int, kept: Mapping[str, bytes]) -> None:
@@ -130,6 +131,17 @@ class ChannelState:
         if change.device == self.sensor:
             return self._identify(change.info_json)
         return self._identify_reference(change.device, change.info_json)
+
+    def on_self_test(self, run: SelfTestRun) -> list[Result]:
+        """The sensor tests itself: it is silent meanwhile. A reference that does is no witness of anything here."""
+        if run.device != self.sensor:
+            return []
+        self._time.update(run.t_monotonic_ns, run.t_utc_ns)
+        self._self_tests.update(run, self._time.now_s)
+        plan = self._channel.self_test
+        if run.state == "begun" or plan is None:
+            return []
+        return [self_test_report(self._source(), run, plan.u_supply_pct)]
 
     def on_command(self, command: Command) -> list[Result]:
         """A command of an operator. A command that was refused before changes nothing."""
@@ -222,7 +234,7 @@ class ChannelState:
 
     def _watch_silence(self) -> list[Result]:
         newest_s = self._streams.by_device[self.sensor].newest_arrival_s
-        silent_s = self._time.now_s - (newest_s if newest_s is not None else 0.0)
+        silent_s = self._time.now_s - max(newest_s if newest_s is not None else 0.0, self._self_tests.until_s)
         if silent_s <= self._channel.silence_s:
             return []
         return self._lose(f"no block of {self.sensor} for more than {self._channel.silence_s:g} s")
@@ -409,6 +421,7 @@ class ChannelState:
             "watch": None if self._watched is None else self._watched.snapshot(),
             "means": None if self._watched is None else self._means.snapshot(),
             **self._clocks.snapshot(),
+            **self._self_tests.snapshot(),
         }
 
     def load(self, state: Mapping[str, Any]) -> None:
@@ -427,6 +440,7 @@ class ChannelState:
         self._kept = dict(state["kept"])
         self._first_day, self._status, self._refused = state["first_day"], state["status"], state["refused"]
         self._clocks.load(state)
+        self._self_tests.load(state)
         if self._watched is not None and (watch := state.get("watch")) is not None:  # earlier states have none
             self._watched.load(watch)
             self._means.load(state["means"])

@@ -72,6 +72,29 @@ class Tick(msgspec.Struct, frozen=True, kw_only=True):
     t_utc_ns: int
 
 
+class SelfTestRun(msgspec.Struct, frozen=True, kw_only=True):
+    """A device tests itself: no samples come between `begun` and `done` or `failed`. `skipped`: it did not begin.
+
+    All in m/s2, over the sensitivity of the data sheet. `motion_mps2` (3,): standard deviation of the samples before.
+    `off_mps2` and `on_mps2`: means of the phases without and with the self-test, in turn, three after three; the first
+    and the last phase is one without. `low_mps2`, `high_mps2` (3,): limits of the maker. The response grows with the
+    supply to the power of `supply_exponent` (3,). `temperature_degc`: mean of all phases; NaN where none is told.
+    """
+
+    device: str
+    state: Literal["begun", "done", "skipped", "failed"]
+    t_monotonic_ns: int
+    t_utc_ns: int
+    message: str = ""  # why it was skipped, or has failed
+    motion_mps2: list[float] = []
+    off_mps2: list[float] = []
+    on_mps2: list[float] = []
+    low_mps2: list[float] = []
+    high_mps2: list[float] = []
+    supply_exponent: list[float] = []
+    temperature_degc: float = float("nan")
+
+
 class Command(msgspec.Struct, frozen=True, kw_only=True):
     """A command of an operator. A refused command is an event too, so that it is recorded, but it changes nothing.
 
@@ -108,7 +131,7 @@ class Pruned(msgspec.Struct, frozen=True, kw_only=True):
     previous_sha256: str = ""  # that the first deleted file names as the one of the file before it
 
 
-Event = RunStart | SampleBlock | DeviceChange | Gap | Command | Pruned | Tick
+Event = RunStart | SampleBlock | DeviceChange | Gap | SelfTestRun | Command | Pruned | Tick
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -370,6 +393,28 @@ class WatchReport(Result, frozen=True, kw_only=True):
     calibration_sequence: int
     u_main_pct: list[float]
     gravity: str = ""
+
+
+class SelfTestReport(Result, frozen=True, kw_only=True):
+    """What the self-test of a device shows, or why it shows nothing (`reason`, else "").
+
+    `response_mps2` (3,): change of the mean of x, y, z by the self-test, over the sensitivity of the data sheet, so
+    that no calibration moves it; `u_response_mps2` from the scatter of `pairs` of phases with and without it; NaN where
+    it did not run. `u_supply_pct` (3,): standard uncertainty of the response by the supply voltage, which nobody
+    measures and which all axes share. `motion_mps2` (3,): standard deviation of the samples before. `faults`: what is
+    beyond the limits of the maker.
+    """
+
+    what: ClassVar[str] = "self_test"
+
+    reason: str
+    response_mps2: list[float]
+    u_response_mps2: list[float]
+    u_supply_pct: list[float]
+    pairs: int
+    motion_mps2: list[float]
+    temperature_degc: float
+    faults: list[str]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

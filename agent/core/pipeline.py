@@ -22,6 +22,7 @@ from agent.core.events import (
     Output,
     Result,
     RunStart,
+    SelfTestRun,
     StatusChange,
     Tick,
     WindowReport,
@@ -129,6 +130,8 @@ class Pipeline:
             return channel.on_tick(event)
         if isinstance(event, DeviceChange):
             return channel.on_device(event)
+        if isinstance(event, SelfTestRun):
+            return channel.on_self_test(event)
         if isinstance(event, Command):
             return channel.on_command(event)
         return []  # a Gap is recorded for people; the pipeline sees it in the flags and indices of the blocks

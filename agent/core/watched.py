@@ -47,14 +47,14 @@ def is_newer(channel: Channel, stated: Calibration, in_force: CalibrationUpdate 
 
 def aged(law: Law, channel: Channel, in_force: CalibrationUpdate, t_utc_ns: int) -> Law:
     """The law in whole hours after the date of the calibration in force: S and Q may have walked, and Q drifted."""
-    return law.aged(_walked(channel, in_force, t_utc_ns))
+    return law.aged(walked(channel, in_force, t_utc_ns))
 
 
-def _walked(channel: Channel, in_force: CalibrationUpdate, t_utc_ns: int) -> Array:
+def walked(channel: Channel, in_force: CalibrationUpdate, t_utc_ns: int) -> Array:
     """(12,) variance that S and Q gained since."""
     hours = max((t_utc_ns - in_force.date_utc_ns) // HOUR_NS, 0)
     scale = scale_of(np.ravel(in_force.sensitivity))
-    drift = np.hypot(in_force.offset_rate, in_force.u_offset_rate)
+    drift = np.hypot(in_force.offset_rate or np.zeros(3), in_force.u_offset_rate or np.zeros(3))
     return channel.wander().variance_after(hours / 24.0, scale, 0.0, drift)
 
 

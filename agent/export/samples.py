@@ -14,12 +14,13 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config import recorded_config
+from agent.config import Channel, recorded_config
 from agent.core.events import CalibrationUpdate, DeviceChange, RunStart, StatusChange
 from agent.core.identity import device_of, identity_of
 from agent.core.kept import update_of
 from agent.core.snapshot import unpack
 from agent.core.stream import UNCOUNTED, DeviceStream
+from agent.export.between_visits import BetweenVisits, at_temperature, solved
 from agent.export.smoothing import Smoothed
 from agent.recording.reading import RecordedStep, RecordingReader, first_event
 from agent.site_watch.suspicion import Suspicion
@@ -65,7 +66,7 @@ class RecordedContent:
     axes: int = 0
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
-    smoothed: Smoothed | None = None
+    smoothed: Smoothed | BetweenVisits | None = None
     suspicion: Suspicion | None = None
     left_out: Counter[str] = field(default_factory=Counter)
 
@@ -142,19 +143,7 @@ def _of_file(path: Path, content: RecordedContent) -> Iterator[ExportedSamples]:
 
 def acceleration(values: Array, calibration: CalibrationUpdate, degc: float | None) -> Array | None:
     """a = S^-1 (V - Q) in m/s2 at this temperature, which is only known where the device tells it; None: no inverse."""
-    S, Q = np.array(calibration.sensitivity), np.array(calibration.offset)
-    if degc is not None and np.isfinite(calibration.reference_temperature_degc):
-        above = degc - calibration.reference_temperature_degc
-        for k, coefficient in enumerate(calibration.offset_temperature, start=1):
-            Q = Q + np.array(coefficient) * above**k
-        if calibration.sensitivity_per_k:
-            S = S + np.array(calibration.sensitivity_per_k) * above
-        if calibration.sensitivity_temperature:  # of an engine before 13
-            S = S * (1.0 + np.array(calibration.sensitivity_temperature) * above)[:, None]
-    try:
-        return np.asarray(np.linalg.solve(S, (values - Q).T).T)
-    except np.linalg.LinAlgError:
-        return None
+    return solved(*at_temperature(calibration, degc), values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +262,17 @@ def steps_of(path: Path, faults: list[str]) -> Iterator[RecordedStep]:
 
 def sensors_of(path: Path) -> list[str]:
     """The sensors of a recording's configuration. Raises ExportError."""
+    return [channel.sensor for channel in _channels(path)]
+
+
+def channel_of(path: Path, sensor: str) -> Channel | None:
+    """The channel of a sensor in a recording's configuration; None for another device. Raises ExportError."""
+    return next((channel for channel in _channels(path) if channel.sensor == sensor), None)
+
+
+def _channels(path: Path) -> Sequence[Channel]:
     try:
-        return [channel.sensor for channel in recorded_config(start_of(path).config_json).channels]
+        return recorded_config(start_of(path).config_json).channels
     except ValueError as error:
         raise ExportError(f"{path}: its configuration cannot be read: {error}") from None
 

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -26,7 +26,7 @@ from agent.monitor import summaries
 from agent.monitor.engines import QueryRunner
 from agent.monitor.summaries import unpacked
 from agent.site_watch.day_sum import SHAPES, DaySum, Made, summed
-from agent.site_watch.hour import TWICE, CalibrationLine, WatchHour, wrong
+from agent.site_watch.hour import TWICE, CalibrationLine, SelfTestLine, WatchHour, wrong
 from agent.site_watch.source import SiteSource, WatchError
 from calib.model import Array
 from calib.site_watch.day import HOURS
@@ -49,7 +49,9 @@ SET_NS = 1_600_000_000_000_000_000  # a clock that says earlier is not set
 MOST_SENSORS = 1000  # of a site
 MOST_DAYS = 1100  # days of a site that are looked at, the newest
 CALIBRATIONS = 10  # results in which the one is sought that a sensor had in force
+SELF_TESTS = 100  # results in which that of a day is sought: one a day, and hours are kept for 90 days
 SENT_DAYS = 120  # a sensor without an hour in the last so many days is no longer of the site
+Kind = TypeVar("Kind", bound=msgspec.Struct)
 SQLITE = b"SQLite format 3\0"  # how a database begins
 
 
@@ -211,24 +213,35 @@ def _summed(query: QueryRunner, site: str, day: int) -> DaySum:
         except (ValueError, msgspec.DecodeError):  # damaged on the disk
             continue
     made = {sensor: hour.made for sensor, hour in hours}
-    return summed(day, hours, {(sensor, one): _main(query, sensor, one) for sensor, one in made.items()})
+    mains = {(sensor, one): _main(query, sensor, one) for sensor, one in made.items()}
+    tests = {sensor: test for sensor in made if (test := _self_test(query, sensor, day)) is not None}
+    return summed(day, hours, mains, tests)
 
 
 def _main(query: QueryRunner, sensor: int, made: Made) -> Array:
     """Main sensitivities (3,) of a calibration of a sensor; NaN where its result is not among the newest ones."""
+    found = _newest(query, sensor, "calibration", CalibrationLine, CALIBRATIONS)
+    return next((told.main for told in found if told.made == made), np.full(3, np.nan))
+
+
+def _self_test(query: QueryRunner, sensor: int, day: int) -> SelfTestLine | None:
+    """The self-test of a sensor on a day; None where its result is not among the newest ones."""
+    found = _newest(query, sensor, "self_test", SelfTestLine, SELF_TESTS)
+    return next((told for told in found if told.day == day), None)
+
+
+def _newest(query: QueryRunner, sensor: int, what: str, kind: type[Kind], most: int) -> Iterator[Kind]:
+    """The newest results of a kind, the newest first."""
     rows = query(
-        "SELECT payload FROM result WHERE sensor = :sensor AND what = 'calibration' ORDER BY number DESC"
-        f" LIMIT {CALIBRATIONS}",
-        sensor=sensor,
-    )
+        "SELECT payload FROM result WHERE sensor = :sensor AND what = :what ORDER BY number DESC"
+        f" LIMIT {most}",
+        sensor=sensor, what=what,
+    )  # fmt: skip
     for (payload,) in rows:
         try:
-            told = msgspec.convert(unpacked(payload), CalibrationLine)
+            yield msgspec.convert(unpacked(payload), kind)
         except (zlib.error, ValueError):
             continue
-        if told.made == made:
-            return told.main
-    return np.full(3, np.nan)
 
 
 def sites_of(query: QueryRunner) -> list[str]:

@@ -7,7 +7,7 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class Event(_message.Message):
-    __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick", "command", "pruned")
+    __slots__ = ("event_sequence", "run_start", "device_change", "gap", "tick", "command", "pruned", "self_test_run")
     class RunStart(_message.Message):
         __slots__ = ("run_id", "site", "gateway", "boot_id", "t_monotonic_ns", "t_utc_ns", "config_json", "versions", "fingerprint", "snapshot", "file_sequence", "continuation", "engine", "engine_sha256")
         class VersionsEntry(_message.Message):
@@ -130,6 +130,33 @@ class Event(_message.Message):
         epoch: str
         previous_sha256: str
         def __init__(self, t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., first_file: _Optional[int] = ..., last_file: _Optional[int] = ..., last_sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., epoch: _Optional[str] = ..., previous_sha256: _Optional[str] = ...) -> None: ...
+    class SelfTestRun(_message.Message):
+        __slots__ = ("device", "state", "t_monotonic_ns", "t_utc_ns", "message", "motion_mps2", "off_mps2", "on_mps2", "low_mps2", "high_mps2", "supply_exponent", "temperature_degc")
+        DEVICE_FIELD_NUMBER: _ClassVar[int]
+        STATE_FIELD_NUMBER: _ClassVar[int]
+        T_MONOTONIC_NS_FIELD_NUMBER: _ClassVar[int]
+        T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+        MESSAGE_FIELD_NUMBER: _ClassVar[int]
+        MOTION_MPS2_FIELD_NUMBER: _ClassVar[int]
+        OFF_MPS2_FIELD_NUMBER: _ClassVar[int]
+        ON_MPS2_FIELD_NUMBER: _ClassVar[int]
+        LOW_MPS2_FIELD_NUMBER: _ClassVar[int]
+        HIGH_MPS2_FIELD_NUMBER: _ClassVar[int]
+        SUPPLY_EXPONENT_FIELD_NUMBER: _ClassVar[int]
+        TEMPERATURE_DEGC_FIELD_NUMBER: _ClassVar[int]
+        device: str
+        state: str
+        t_monotonic_ns: int
+        t_utc_ns: int
+        message: str
+        motion_mps2: _containers.RepeatedScalarFieldContainer[float]
+        off_mps2: _containers.RepeatedScalarFieldContainer[float]
+        on_mps2: _containers.RepeatedScalarFieldContainer[float]
+        low_mps2: _containers.RepeatedScalarFieldContainer[float]
+        high_mps2: _containers.RepeatedScalarFieldContainer[float]
+        supply_exponent: _containers.RepeatedScalarFieldContainer[float]
+        temperature_degc: float
+        def __init__(self, device: _Optional[str] = ..., state: _Optional[str] = ..., t_monotonic_ns: _Optional[int] = ..., t_utc_ns: _Optional[int] = ..., message: _Optional[str] = ..., motion_mps2: _Optional[_Iterable[float]] = ..., off_mps2: _Optional[_Iterable[float]] = ..., on_mps2: _Optional[_Iterable[float]] = ..., low_mps2: _Optional[_Iterable[float]] = ..., high_mps2: _Optional[_Iterable[float]] = ..., supply_exponent: _Optional[_Iterable[float]] = ..., temperature_degc: _Optional[float] = ...) -> None: ...
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_START_FIELD_NUMBER: _ClassVar[int]
     DEVICE_CHANGE_FIELD_NUMBER: _ClassVar[int]
@@ -137,6 +164,7 @@ class Event(_message.Message):
     TICK_FIELD_NUMBER: _ClassVar[int]
     COMMAND_FIELD_NUMBER: _ClassVar[int]
     PRUNED_FIELD_NUMBER: _ClassVar[int]
+    SELF_TEST_RUN_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
     run_start: Event.RunStart
     device_change: Event.DeviceChange
@@ -144,7 +172,8 @@ class Event(_message.Message):
     tick: Event.Tick
     command: Event.Command
     pruned: Event.Pruned
-    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ..., command: _Optional[_Union[Event.Command, _Mapping]] = ..., pruned: _Optional[_Union[Event.Pruned, _Mapping]] = ...) -> None: ...
+    self_test_run: Event.SelfTestRun
+    def __init__(self, event_sequence: _Optional[int] = ..., run_start: _Optional[_Union[Event.RunStart, _Mapping]] = ..., device_change: _Optional[_Union[Event.DeviceChange, _Mapping]] = ..., gap: _Optional[_Union[Event.Gap, _Mapping]] = ..., tick: _Optional[_Union[Event.Tick, _Mapping]] = ..., command: _Optional[_Union[Event.Command, _Mapping]] = ..., pruned: _Optional[_Union[Event.Pruned, _Mapping]] = ..., self_test_run: _Optional[_Union[Event.SelfTestRun, _Mapping]] = ...) -> None: ...
 
 class RawBlock(_message.Message):
     __slots__ = ("event_sequence", "device", "boot_id", "t_utc_ns", "first_index", "nominal_rate_hz", "flags", "temperature_raw", "temperature_degc", "axes", "decimal", "burst_t_monotonic_ns", "burst_count", "x_counts", "y_counts", "z_counts", "x", "y", "z", "first_burst_t_monotonic_ns", "burst_sizes", "order", "first_values", "differences", "decimal_places", "negative_zeros", "burst_intervals_ns")
@@ -672,6 +701,40 @@ class Watch(_message.Message):
     engine: str
     signature: bytes
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., hour_utc_ns: _Optional[int] = ..., duration_s: _Optional[float] = ..., samples: _Optional[int] = ..., stuck: _Optional[int] = ..., clipped: _Optional[int] = ..., missing: _Optional[int] = ..., segments: _Optional[int] = ..., mean_mps2: _Optional[_Iterable[float]] = ..., mean_scatter_mps2: _Optional[_Iterable[float]] = ..., temperature_degc: _Optional[float] = ..., temperature_scatter_degc: _Optional[float] = ..., noise_psd: _Optional[_Iterable[float]] = ..., band_hz: _Optional[_Iterable[float]] = ..., band_power: _Optional[_Iterable[float]] = ..., cross_power: _Optional[_Iterable[float]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., u_main_pct: _Optional[_Iterable[float]] = ..., gravity: _Optional[str] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
+
+class Self_test(_message.Message):
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "reason", "response_mps2", "u_response_mps2", "u_supply_pct", "pairs", "motion_mps2", "temperature_degc", "faults", "engine", "signature")
+    EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    RUN_ID_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    T_UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    RESPONSE_MPS2_FIELD_NUMBER: _ClassVar[int]
+    U_RESPONSE_MPS2_FIELD_NUMBER: _ClassVar[int]
+    U_SUPPLY_PCT_FIELD_NUMBER: _ClassVar[int]
+    PAIRS_FIELD_NUMBER: _ClassVar[int]
+    MOTION_MPS2_FIELD_NUMBER: _ClassVar[int]
+    TEMPERATURE_DEGC_FIELD_NUMBER: _ClassVar[int]
+    FAULTS_FIELD_NUMBER: _ClassVar[int]
+    ENGINE_FIELD_NUMBER: _ClassVar[int]
+    SIGNATURE_FIELD_NUMBER: _ClassVar[int]
+    event_sequence: int
+    run_id: str
+    sequence: int
+    sensor: str
+    t_utc_ns: int
+    reason: str
+    response_mps2: _containers.RepeatedScalarFieldContainer[float]
+    u_response_mps2: _containers.RepeatedScalarFieldContainer[float]
+    u_supply_pct: _containers.RepeatedScalarFieldContainer[float]
+    pairs: int
+    motion_mps2: _containers.RepeatedScalarFieldContainer[float]
+    temperature_degc: float
+    faults: _containers.RepeatedScalarFieldContainer[str]
+    engine: str
+    signature: bytes
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., reason: _Optional[str] = ..., response_mps2: _Optional[_Iterable[float]] = ..., u_response_mps2: _Optional[_Iterable[float]] = ..., u_supply_pct: _Optional[_Iterable[float]] = ..., pairs: _Optional[int] = ..., motion_mps2: _Optional[_Iterable[float]] = ..., temperature_degc: _Optional[float] = ..., faults: _Optional[_Iterable[str]] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Acceleration(_message.Message):
     __slots__ = ("event_sequence", "sensor", "t_utc_ns", "first_index", "rate_hz", "x", "y", "z", "covariance", "noise", "determined", "calibration_run_id", "calibration_sequence", "dynamic_only", "suspect")

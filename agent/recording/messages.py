@@ -27,6 +27,7 @@ from agent.core.events import (
     Pruned,
     Result,
     RunStart,
+    SelfTestRun,
     SharedError,
     Tick,
 )
@@ -43,6 +44,7 @@ _EVENT_FIELDS: dict[type[Any], str] = {
     RunStart: "run_start",
     DeviceChange: "device_change",
     Gap: "gap",
+    SelfTestRun: "self_test_run",
     Command: "command",
     Pruned: "pruned",
     Tick: "tick",

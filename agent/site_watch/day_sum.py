@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from agent.site_watch.hour import WatchHour, grid, values
+from agent.site_watch.hour import SelfTestLine, WatchHour, grid, values
 from calib.model import Array
-from calib.site_watch.day import HOURS, Day, Hours, Visits, day_of
+from calib.site_watch.day import HOURS, Day, Hours, SelfTests, Visits, day_of
 
 Made = tuple[str, int]  # CalibrationUpdate.made: run and sequence
 SHAPES = {
@@ -24,7 +24,12 @@ SHAPES = {
     "mean": "n3",
     "u_main": "n",
     "main": "n3",
+    "self_test": "n3",
+    "self_test_u": "n3",
+    "self_test_supply": "n3",
+    "self_test_degc": "n",
 }
+SELF_TEST = "self_test", "self_test_u", "self_test_supply", "self_test_degc"  # as the fields of SelfTests
 
 
 class DaySum(msgspec.Struct, array_like=True, kw_only=True):
@@ -32,7 +37,8 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
 
     `value` (n, b, 6) to `mean` (n, 3): the fields of calib.site_watch.day.Day, as little-endian float32. `made`: the
     calibration of each sensor in force at the end of the day; `u_main` (n,): its relative standard uncertainty then;
-    `main` (n, 3): its main sensitivities, NaN where they are not known.
+    `main` (n, 3): its main sensitivities, NaN where they are not known. `self_test` and the others: the fields of
+    calib.site_watch.day.SelfTests; empty where no sensor has tested itself.
     """
 
     number: int
@@ -47,18 +53,29 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
     mean: bytes
     u_main: bytes
     main: bytes
+    self_test: bytes = b""
+    self_test_u: bytes = b""
+    self_test_supply: bytes = b""
+    self_test_degc: bytes = b""
 
     def array(self, name: str) -> Array:
         """One of the arrays. Raises ValueError where its length is not that of its shape."""
         sizes = {"n": len(self.sensors), "b": len(self.bands), "3": 3, "6": 6}
         shape = [sizes[k] for k in SHAPES[name]]
+        if name in SELF_TEST and not self.self_test:
+            return np.full(shape, np.nan)
         return np.frombuffer(getattr(self, name), dtype="<f4").astype(float).reshape(shape)
 
 
-def summed(number: int, hours: Iterable[tuple[int, WatchHour]], mains: Mapping[tuple[int, Made], Array]) -> DaySum:
+def summed(
+    number: int,
+    hours: Iterable[tuple[int, WatchHour]],
+    mains: Mapping[tuple[int, Made], Array],
+    self_tests: Mapping[int, SelfTestLine],
+) -> DaySum:
     """The sum of day `number` from the hours of its sensors, in any order, each once.
 
-    `mains`: main sensitivities of calibrations, by sensor and `made`.
+    `mains`: main sensitivities of calibrations, by sensor and `made`. `self_tests` of the day, by sensor.
     """
     rows = sorted(hours, key=lambda row: (row[1].hour, row[0]))
     sensors = sorted({i for i, _ in rows})
@@ -80,9 +97,25 @@ def summed(number: int, hours: Iterable[tuple[int, WatchHour]], mains: Mapping[t
     day = day_of(Hours(HOURS * number + np.arange(HOURS, dtype=float), power, cross, noise, degc, mean), _hz(bands))
     main = [mains.get((i, made[k]), np.full(3, np.nan)) for i, k in at.items()]
     parts = {"value": day.value, "u": day.u, "level": day.level, "log_noise": day.log_noise, "mean": day.mean_mps2,
-             "u_main": u_main, "main": np.array(main)}  # fmt: skip
+             "u_main": u_main, "main": np.array(main), **_self_tests(sensors, self_tests)}  # fmt: skip
     return DaySum(number=number, sensors=sensors, bands=bands, temperature_degc=day.temperature_degc, made=made,
                   **{name: np.asarray(part, dtype="<f4").tobytes() for name, part in parts.items()})  # fmt: skip
+
+
+def _self_tests(sensors: Sequence[int], found: Mapping[int, SelfTestLine]) -> dict[str, Array]:
+    """The arrays of a sum; nothing where no sensor has tested itself."""
+    told = [(k, found[i]) for k, i in enumerate(sensors) if i in found and found[i].usable]
+    if not told:
+        return {}
+    arrays = {name: np.full((len(sensors), 3) if SHAPES[name] == "n3" else len(sensors), np.nan) for name in SELF_TEST}
+    for k, line in told:
+        response = np.abs(values(line.response_mps2))
+        response[~(response > 0.0)] = np.nan
+        degc = math.nan if line.temperature_degc is None else line.temperature_degc
+        shown = np.log(response), values(line.u_response_mps2) / response, values(line.u_supply_pct) / 100.0, degc
+        for name, value in zip(SELF_TEST, shown, strict=True):
+            arrays[name][k] = value
+    return arrays
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +154,11 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
                 visits.there[i], visits.found[i] = True, new_main[k] / main[i] - 1.0
                 visits.u[i] = u_found if math.isfinite(u_found) else math.inf
             made[i], main[i], u_main[i] = one.made[k], new_main[k], new_u[k]
-        yield SiteDay(Day(one.number, value, u, level, noise, one.temperature_degc, mean), visits, u_main.copy())
+        tests = [np.full((n, 3) if SHAPES[name] == "n3" else n, np.nan) for name in SELF_TEST]
+        for name, array in zip(SELF_TEST, tests, strict=True):
+            array[to] = one.array(name)[own]
+        day = Day(one.number, value, u, level, noise, one.temperature_degc, mean, SelfTests(*tests))
+        yield SiteDay(day, visits, u_main.copy())
 
 
 def _hz(bands: Sequence[int]) -> Array:

@@ -13,15 +13,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from io import BufferedReader
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from agent.config.files import open_file
-from agent.core.events import CalibrationUpdate, RunStart, WatchReport
+from agent.core.events import CalibrationUpdate, Result, RunStart, SelfTestReport, WatchReport
 from agent.recording.reading import RecordingReader
 from agent.site_watch.day_sum import DaySum, Made, summed
-from agent.site_watch.hour import TWICE, CalibrationLine, WatchHour, grid, wrong
+from agent.site_watch.hour import TWICE, CalibrationLine, SelfTestLine, WatchHour, grid, wrong
 from agent.site_watch.source import SiteSource, WatchError
 from calib.model import Array
 
@@ -29,6 +29,7 @@ LONGEST_LINE = 1 << 20  # bytes
 MOST_SENSORS = 4000
 RECORDING = b"\x89MCAP0\r\n"  # how a recording begins
 
+Kind = TypeVar("Kind", bound=msgspec.Struct)
 Place = tuple[int, int]  # file and offset of a line
 _HOUR = msgspec.msgpack.Decoder(WatchHour)
 
@@ -45,6 +46,7 @@ class _Files:
         self.first: dict[str, str] = {}
         self.hours: dict[int, dict[tuple[int, int], tuple[int, Place | bytes]]] = {}  # by day, sensor and hour
         self.mains: dict[tuple[int, Made], Array] = {}
+        self.self_tests: dict[int, dict[int, SelfTestLine]] = {}  # by day and sensor
 
     def leave_out(self, reason: str, place: str) -> None:
         self.left_out[reason] += 1
@@ -71,6 +73,13 @@ class _Files:
         """Note the main sensitivities of a calibration."""
         if (i := self.number(gateway, line.sensor)) is not None:
             self.mains[i, line.made] = line.main
+
+    def tested(self, line: SelfTestLine, gateway: str) -> None:
+        """Note a self-test; of two of a day that with the higher sequence."""
+        if (i := self.number(gateway, line.sensor)) is not None:
+            day = self.self_tests.setdefault(line.day, {})
+            if i not in day or day[i].sequence <= line.sequence:
+                day[i] = line
 
     def number(self, gateway: str, sensor: str) -> int | None:
         """The number of a sensor; None where there are too many."""
@@ -119,18 +128,22 @@ def _line(found: _Files, at: Place, data: bytes, stem: str) -> str:
     try:
         line = msgspec.json.decode(data, type=WatchHour)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        if (told := _calibration(data)) is None:
+        if (made := _decoded(data, CalibrationLine)) is not None:
+            found.calibrated(made, made.gateway or _named(made.key)[1] or stem)
+        elif (test := _decoded(data, SelfTestLine)) is not None:
+            found.tested(test, test.gateway or _named(test.key)[1] or stem)
+        else:
             return f"not a watch result: {_short(str(error))}"
         found.lines -= 1
-        found.calibrated(told, told.gateway or _named(told.key)[1] or stem)
         return ""
     site, gateway = _named(line.key)
     return found.take(line, line.site or site, line.gateway or gateway or stem, at)
 
 
-def _calibration(data: bytes) -> CalibrationLine | None:
+def _decoded(data: bytes, kind: type[Kind]) -> Kind | None:
+    """A line as a result of this kind; None where it is none."""
     try:
-        return msgspec.json.decode(data, type=CalibrationLine)
+        return msgspec.json.decode(data, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None
 
@@ -150,9 +163,11 @@ def _read_recording(found: _Files, path: Path) -> None:
         for result in step.results:
             if isinstance(result, WatchReport):
                 found.lines += 1
-                hour = WatchHour(**_as_json(result))
+                hour = WatchHour(**_as_json(result, WatchHour))
                 if reason := found.take(hour, site, gateway, msgspec.msgpack.encode(hour)):
                     found.leave_out(reason, f"{path}: result {result.sequence}")
+            elif isinstance(result, SelfTestReport):
+                found.tested(SelfTestLine(**_as_json(result, SelfTestLine)), gateway)
             elif isinstance(result, CalibrationUpdate):
                 line = CalibrationLine(sensor=result.sensor, sensitivity=_known(result.sensitivity),
                                        run_id=result.made[0], sequence=result.made[1])  # fmt: skip
@@ -163,10 +178,10 @@ def _read_recording(found: _Files, path: Path) -> None:
         )
 
 
-def _as_json(report: WatchReport) -> dict[str, Any]:
+def _as_json(report: Result, kind: type[msgspec.Struct]) -> dict[str, Any]:
     """The fields that are used; None for NaN."""
     told = msgspec.structs.asdict(report)
-    return {name: _known(told[name]) for name in WatchHour.__struct_fields__ if name in told}
+    return {name: _known(told[name]) for name in kind.__struct_fields__ if name in told}
 
 
 def _known(value: Any) -> Any:
@@ -180,7 +195,7 @@ def _sums(found: _Files, paths: Sequence[Path]) -> Iterator[DaySum]:
         opened = [stack.enter_context(open_file(path)) for path in paths]
         for number in sorted(found.hours):
             rows = ((i, _read(opened, at)) for (i, _), (_, at) in found.hours[number].items())
-            yield summed(number, rows, found.mains)
+            yield summed(number, rows, found.mains, found.self_tests.get(number, {}))
 
 
 def _read(opened: Sequence[BufferedReader], at: Place | bytes) -> WatchHour:

@@ -68,6 +68,34 @@ class WatchHour(msgspec.Struct, kw_only=True):
         return max((u / 100.0 for u in self.u_main_pct if u is not None and u > 0.0), default=math.nan)
 
 
+class SelfTestLine(msgspec.Struct, kw_only=True):
+    """What is used of a `self_test` result."""
+
+    sensor: str
+    t_utc_ns: int
+    response_mps2: Numbers
+    u_response_mps2: Numbers
+    u_supply_pct: Numbers
+    temperature_degc: float | None = None
+    sequence: int = 0
+    key: str = ""
+    gateway: str = ""
+
+    @property
+    def day(self) -> int:
+        """Days since 1970."""
+        return self.t_utc_ns // (HOURS * HOUR_NS)
+
+    @property
+    def usable(self) -> bool:
+        """Whether it tells a response of any axis, in numbers that can be believed."""
+        told = self.response_mps2, self.u_response_mps2, self.u_supply_pct
+        size = np.abs([values(each) if len(each) == 3 else np.full(3, np.nan) for each in told])
+        degc = self.temperature_degc
+        sound = (size <= LARGEST_MEAN).all(axis=0) & (size[0] > 0.0)
+        return bool(sound.any()) and (degc is None or -100.0 <= degc <= 200.0)
+
+
 class CalibrationLine(msgspec.Struct, kw_only=True):
     """What is used of a `calibration` result: S, and which one it is."""
 

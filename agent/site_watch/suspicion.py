@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate
@@ -20,6 +21,7 @@ from calib.model import Array
 from calib.site_watch.verdicts import COVERAGE, SensorVerdict
 from calib.site_watch.witnesses import Witness
 
+DAY_NS = 86_400 * 10**9
 SOURCE = "suspected change"  # of a budget
 LARGEST_FILE = 64 << 20  # bytes of a file of verdicts; a sensor has 2 kB
 # Of calib.site_watch.together.DIRECTIONS; the last is of a gateway (direction -1).
@@ -70,6 +72,17 @@ class Suspicion(msgspec.Struct):
         moved = np.append((sensitivity @ D).ravel(), np.zeros(3))
         variance = self.size**2 + (self.expanded_uncertainty / COVERAGE) ** 2
         return np.asarray(covariance + variance * np.outer(moved, moved))
+
+    @property
+    def directions(self) -> NDArray[np.bool_]:
+        """(3,) whether the sensitivities to x, y, z change: the columns of S."""
+        named = np.isin(list("xyz"), list(self.axes))
+        return np.asarray(~named if self.turn else named)
+
+    @property
+    def span_utc_ns(self) -> tuple[int, int]:
+        """From the begin of the first day on which the change may have come to the end of the last one."""
+        return _ns(self.earliest), _ns(self.latest) + DAY_NS
 
     def holds_of(self, made_utc_ns: int) -> bool:
         """Whether a calibration was made before the change; one that was made after it has found it."""
@@ -151,7 +164,7 @@ def sentence(told: SensorVerdict) -> str:
 
 
 def _heard(one: Witness) -> str:
-    name = "the structure" if one.name == "structure" else one.name
+    name = f"the {one.name}" if one.name in ("structure", "self-test") else one.name
     if one.says == "silent":
         return f"{name} is silent"
     if one.says == "contradicts":

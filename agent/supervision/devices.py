@@ -8,7 +8,8 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from agent.core.events import DeviceChange, Gap
+from agent.core.events import DeviceChange, Gap, SelfTestRun
+from agent.core.self_tests import LONGEST_S as SELF_TEST_S
 from calib.signal.timing import ClockModel
 from hw.block import BlockFlags, SampleBlock
 
@@ -104,6 +105,12 @@ class DeviceWatch:
         self._opened_ns = change.t_monotonic_ns
         self._newest.clear()
         self._clock = None
+
+    def on_self_test(self, run: SelfTestRun) -> None:
+        """Take a SelfTestRun: no samples are due until it ends."""
+        if run.state == "begun":
+            self._opened_ns = run.t_monotonic_ns + round(SELF_TEST_S * 1e9)
+            self._newest.clear()
 
     def on_gap(self, gap: Gap) -> None:
         """Take a Gap: data of the device were dropped."""

@@ -19,6 +19,7 @@ from agent.core.events import (
     Event,
     Gap,
     Result,
+    SelfTestRun,
     StatusChange,
     WindowReport,
 )
@@ -169,6 +170,8 @@ class Health:
             self._devices[event.device].on_change(event)
         elif isinstance(event, Gap):
             self._devices[event.device].on_gap(event)
+        elif isinstance(event, SelfTestRun):
+            self._devices[event.device].on_self_test(event)
         for result in results:
             self._take(result)
 

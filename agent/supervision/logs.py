@@ -21,7 +21,7 @@ from typing import Any
 
 import msgspec
 
-from agent.core.events import Command, DeviceChange, Event, Gap, Pruned, Result
+from agent.core.events import Command, DeviceChange, Event, Gap, Pruned, Result, SelfTestRun
 from agent.terminal.wording import gap_line, result_lines
 
 _JOURNAL = logging.getLogger("fieldcal")
@@ -161,6 +161,8 @@ def log_event(event: Event, results: Sequence[Result]) -> None:
         tell("device", message, event.state == "lost", device=event.device, state=event.state, attempt=event.attempt)
     elif isinstance(event, Gap):
         tell("gap", gap_line(event), True, device=event.device, dropped=event.dropped, unit=event.unit)
+    elif isinstance(event, SelfTestRun) and event.state == "begun":
+        tell("device", f"{event.device}: tests itself, and sends no samples", device=event.device, state="self-test")
     elif isinstance(event, Command):
         refused = f"refused: {event.refused}" if event.refused else "taken"
         tell("command", f"{event.sensor}: command {event.verb} {refused}", bool(event.refused), **_fields(event))

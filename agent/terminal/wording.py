@@ -16,6 +16,7 @@ from agent.core.events import (
     Estimate,
     Gap,
     Result,
+    SelfTestReport,
     StatusChange,
     WatchReport,
     WindowReport,
@@ -49,6 +50,8 @@ def result_lines(result: Result, truth: ShownTruth | None) -> list[str]:
             return [f"{result.sensor}: {clock_words(result)}"]
         case WatchReport():
             return [f"{result.sensor}: {watch_words(result)}"]
+        case SelfTestReport():
+            return [f"{result.sensor}: {self_test_words(result)}"]
         case CalibrationUpdate():
             lines = [f"{result.sensor}: calibration from {result.windows} windows, {uncertainty_words(result)}"]
             lines += [f"  {row}" for row in calibration_rows(result)]
@@ -95,6 +98,18 @@ def watch_words(watch: WatchReport) -> str:
     wrong = [f"{count} {name}" for name in ("missing", "clipped", "stuck") if (count := getattr(watch, name))]
     words += f"; samples: {', '.join(wrong)}" if wrong else ""
     return f"{words}; {watch.gravity}" if watch.gravity else words
+
+
+def self_test_words(told: SelfTestReport) -> str:
+    """The response of each axis with U of its scatter, and what is wrong with it; or why there is none."""
+    if told.reason:
+        return f"self-test: {told.reason}"
+    axes = zip("xyz", told.response_mps2, told.u_response_mps2, strict=True)
+    words = ", ".join(f"{axis} {plus_minus(value, COVERAGE_FACTOR * u)}" for axis, value, u in axes)
+    words = f"self-test: {words} m/s²"
+    if math.isfinite(told.temperature_degc):
+        words += f" at {told.temperature_degc:.1f} °C"
+    return "; ".join([words, *told.faults])
 
 
 def gap_line(gap: Gap) -> str:

@@ -49,11 +49,25 @@ class Hours:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SelfTests:
+    """The self-test of each sensor on a day; NaN where there was none.
+
+    `log_response` (n, 3): log of the size of the response of x, y, z; `u` (n, 3): its standard uncertainty from the
+    scatter of this night; `u_supply` (n, 3): by the supply, which all axes of a sensor share. `temperature_degc` (n,).
+    """
+
+    log_response: Array
+    u: Array
+    u_supply: Array
+    temperature_degc: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Day:
     """One day. `value`, `u` (n, B, 6): the channels with the standard uncertainty that their noise gives; NaN and inf
     where a channel does not count. `level` (B, 3): log amplitude of the level. `log_noise` (n, 3): half the log of the
     noise floor. `temperature_degc`: the median of all sensors; NaN where none tells one. `mean_mps2` (n, 3): the median
-    of the hours.
+    of the hours. `self_tests`: None where no sensor has one.
     """
 
     number: int
@@ -63,6 +77,7 @@ class Day:
     log_noise: Array
     temperature_degc: float
     mean_mps2: Array | None = None
+    self_tests: SelfTests | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

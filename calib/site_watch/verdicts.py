@@ -18,7 +18,7 @@ from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR_DEGREES, TERMS, Steps
 from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, jointly, median
 from calib.site_watch.watch import VISIT, SiteWatch, pooled
-from calib.site_watch.witnesses import Witness, gravity, noise
+from calib.site_watch.witnesses import Witness, gravity, noise, self_test
 
 FALSE_ALARMS_PER_YEAR = 0.5  # of a whole site, at most, where the model of the scatter holds
 LOOKS_PER_YEAR = 1000.0  # independent looks of a test: a new one each day for steps of a few days, fewer for older ones
@@ -136,7 +136,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
         site = _structure(tests, sensors)
         if known_u is not None and anchored.any():
             common = _common_change(tests, known_u[anchored], anchored)
-        sensors = [_witnessed(watch, i, told) for i, told in enumerate(sensors)]
+        sensors = [witnessed(watch, i, told) for i, told in enumerate(sensors)]
         month = int(np.argmin([abs(watch.day - begin + 1 - MONTH_DAYS) for begin in tests.begins]))
         least = limit * tests.joint.u[month, :, :3]
     common = common or _common_by_visits(watch)
@@ -216,15 +216,19 @@ def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorV
     return noise
 
 
-def _witnessed(watch: SiteWatch, i: int, told: SensorVerdict) -> SensorVerdict:
-    """The verdict with what each witness says of it at its date."""
+def witnessed(watch: SiteWatch, i: int, told: SensorVerdict) -> SensorVerdict:
+    """The verdict of sensor `i` with what each witness says of it at its date."""
     if told.kind not in ("sensitivity", "turn"):
         return told
     k, u = watch.means.begins.index(told.since), told.U / COVERAGE
     step, u_step = (part[0, i] for part in _followed(watch, watch.means, watch.mean_scatter, [k]))
     floor, u_floor = (part[0, i] for part in _followed(watch, watch.noise, watch.noise_scatter, [k]))
     mean = watch.means.beta[0].reshape(-1, 3)[i]
+    others: tuple[Witness, ...]
     others = gravity(told.direction, told.size, u, mean, step, u_step), noise(told.direction, floor, u_floor)
+    if watch.self_tests.days.reshape(-1, 3)[i].any():
+        shown, u_shown = (part[0, i] for part in _followed(watch, watch.self_tests, watch.self_test_scatter, [k]))
+        others = *others, self_test(told.direction, told.size, u, shown, u_shown, watch.u_supply[i])
     return replace(told, witnesses=(Witness("structure", "agrees", told.size, u), *others))
 
 

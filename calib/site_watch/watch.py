@@ -12,16 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.model import Array
-from calib.site_watch.day import Day, Visits
+from calib.site_watch.day import Day, SelfTests, Visits
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import HUBER, PRIOR_DEGREES, TERMS, Steps
 from calib.site_watch.together import DIRECTIONS, biweight, design, scores
+from calib.site_watch.witnesses import supply_basis
 
 ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
 FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, or its residual to count
 FEWEST_SENSORS = 3  # with a band, for its common level to be taken out
 CHANNELS = 6
 WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
+U_SELF_TEST = 0.001  # of the log of a response, however little it scatters; only ratios of weights depend on it
 U_MEAN_MPS2 = 0.001  # of the mean of a day; only ratios of weights depend on it
 # The prior of the coefficients of the mean, in m/s² where steps.PRIOR has log amplitudes, is ten times as wide.
 MEAN_PRIOR_SCALE = 0.01
@@ -41,10 +43,13 @@ class SiteWatch:
         self.steps = Steps(int(np.prod(self.shape)))
         self.noise = Steps(self.shape[0] * 3)
         self.means = Steps(self.shape[0] * 3, MEAN_PRIOR_SCALE)
+        self.self_tests = Steps(self.shape[0] * 3)
+        self.u_supply = np.full((self.shape[0], 3), np.nan)  # of the newest self-test
         self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)))
         self.band_scatter = Blocks(self.shape, lags=(1, 7))
         self.noise_scatter = Blocks((self.shape[0], 3))
         self.mean_scatter = Blocks((self.shape[0], 3))
+        self.self_test_scatter = Blocks((self.shape[0], 3))
         self.visits = np.zeros((0, len(VISIT)))  # of each visit that taught something
         self.origin = np.full((self.shape[1], 3), np.nan)  # levels of the first day
         self.seen_degc = np.tile([np.inf, -np.inf], (self.shape[0], 1))
@@ -80,10 +85,13 @@ class SiteWatch:
         weight *= np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9))
         self.steps.update(day.number, x, value.ravel(), weight.ravel())
         self.days_scatter.remember(self.steps.begins)
-        self._follow(self.noise, self.noise_scatter, day.log_noise, 1.0, day)
+        degc = np.full(self.shape[0], day.temperature_degc)
+        self._follow(self.noise, self.noise_scatter, day.log_noise, np.ones((self.shape[0], 3)), degc)
         untold = visited[:, None] if day.mean_mps2 is not None else True
         mean = np.where(untold, np.nan, 0.0 if day.mean_mps2 is None else day.mean_mps2)
-        self._follow(self.means, self.mean_scatter, np.broadcast_to(mean, (self.shape[0], 3)), U_MEAN_MPS2, day)
+        u_mean = np.full((self.shape[0], 3), U_MEAN_MPS2)
+        self._follow(self.means, self.mean_scatter, np.broadcast_to(mean, u_mean.shape), u_mean, degc)
+        self._take_self_tests(day, visited)
         self._seen(there.sum(axis=(1, 2)) > 0)
         mean = self.steps.beta[0].reshape(self.shape)
         self.G = design(np.where(self.steps.days.reshape(self.shape) > 0, mean, np.nan), np.nan_to_num(self.origin))
@@ -117,7 +125,7 @@ class SiteWatch:
         """The watch of a snapshot."""
         watch = cls(told["gateway"], told["band_hz"])
         watch.day, watch.degc = int(told["day"]), float(told["degc"])
-        for name in ("origin", "seen_degc", "G", "visits"):
+        for name in ("origin", "seen_degc", "G", "visits", "u_supply"):
             setattr(watch, name, told[name].copy())
         for name in _PARTS:
             getattr(watch, name).load(told[name])
@@ -127,6 +135,7 @@ class SiteWatch:
         channels = np.broadcast_to(visited[:, None, None], self.shape).ravel()
         self.steps.restart(channels)
         self.means.restart(np.repeat(visited, 3))
+        self.self_tests.restart(np.repeat(visited, 3))
         self.seen_degc[visited] = np.inf, -np.inf
 
     def _regressors(self, day: Day) -> Array:
@@ -154,20 +163,41 @@ class SiteWatch:
         known = squares > 0.0
         self.days_scatter.update(score / np.sqrt(np.where(known, squares, 1.0)), known)
 
-    def _follow(self, steps: Steps, scatter: Blocks, told: Array, u: float, day: Day) -> None:
-        """Noise floors and means (n, 3) are followed as the channels are, without a level; `u`: of one of them."""
+    def _take_self_tests(self, day: Day, visited: NDArray[np.bool_]) -> None:
+        """Responses are followed along and across what the supply does to them, at the temperature of their night, or
+        at that of the site where the device tells none. A night counts where all three axes are told."""
+        none = np.full((self.shape[0], 3), np.nan)
+        tests = day.self_tests or SelfTests(none, none, none, none[:, 0])
+        there = (
+            np.isfinite(tests.log_response + tests.u + tests.u_supply).all(axis=1, keepdims=True) & ~visited[:, None]
+        )
+        self.u_supply = np.where(there, tests.u_supply, self.u_supply)
+        basis = supply_basis(self.u_supply)
+        response = np.where(there, np.einsum("nij,nj->ni", basis, tests.log_response), np.nan)
+        u = np.sqrt(U_SELF_TEST**2 + np.einsum("nij,nj->ni", basis**2, tests.u**2))
+        own = tests.temperature_degc
+        degc = np.where(np.isfinite(own), own, day.temperature_degc)
+        self._follow(self.self_tests, self.self_test_scatter, response, u, degc, squared=True)
+
+    def _follow(
+        self, steps: Steps, scatter: Blocks, told: Array, u: Array, degc: Array, *, squared: bool = False
+    ) -> None:
+        """Noise floors, means and responses (n, 3) are followed as the channels are, without a level; `u` (n, 3): of
+        one of them; `degc` (n,). `squared`: the norm has the square of the temperature too."""
         value = told.ravel()
         there = np.isfinite(value)
         x = np.zeros((TERMS, len(value)))
         x[0] = 1.0
-        x[1] = np.nan_to_num((day.temperature_degc - ORIGIN_DEGC) / SCALE_K)
+        x[1] = np.repeat(np.nan_to_num((degc - ORIGIN_DEGC) / SCALE_K), 3)
+        x[2] = x[1] ** 2 if squared else 0.0
+        u2_told = np.where(there, np.square(u.ravel()), 1.0)
         expected, u2 = steps.expected(x)
         s2 = pooled(*steps.rest(), (self.shape[0], 3)).ravel()
-        z = (np.nan_to_num(value) - expected) / np.sqrt(np.maximum(s2, 1e-12) * (u * u + u2))
+        z = (np.nan_to_num(value) - expected) / np.sqrt(np.maximum(s2, 1e-12) * (u2_told + u2))
         known = there & (steps.days - TERMS >= FEWEST_LEFT)
         scatter.update(z.reshape(-1, 3), known.reshape(-1, 3))
-        weight = there / (u * u) * np.where(known, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)), 1.0)
-        steps.update(day.number, x, np.nan_to_num(value), weight)
+        weight = there / u2_told * np.where(known, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)), 1.0)
+        steps.update(self.day, x, np.nan_to_num(value), weight)
         scatter.remember(steps.begins)
 
     def _seen(self, told: NDArray[np.bool_]) -> None:
@@ -176,8 +206,11 @@ class SiteWatch:
             self.seen_degc[told, 1] = np.maximum(self.seen_degc[told, 1], self.degc)
 
 
-_OWN = ("origin", "seen_degc", "degc", "G", "visits")
-_PARTS = ("steps", "noise", "means", "days_scatter", "band_scatter", "noise_scatter", "mean_scatter")
+_OWN = ("origin", "seen_degc", "degc", "G", "visits", "u_supply")
+_PARTS = (
+    *("steps", "noise", "means", "self_tests"),
+    *("days_scatter", "band_scatter", "noise_scatter", "mean_scatter", "self_test_scatter"),
+)
 
 
 def pooled(left: Array, freedom: Array, shape: tuple[int, ...]) -> Array:

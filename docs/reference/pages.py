@@ -125,7 +125,15 @@ def messages() -> Iterator[str]:
         yield from [f"## Result `{what}`", "", _flat(kind.__doc__), "", *_fields(kind, own)]
     for kind in (events.BandResponse, events.SteadySensitivity, events.SharedError):
         yield from [f"## Part `{kind.__name__}`", "", _flat(kind.__doc__), "", *_fields(kind, set())]
-    for kind in (events.RunStart, events.DeviceChange, events.Gap, events.Command, events.Pruned, events.Tick):
+    for kind in (
+        events.RunStart,
+        events.DeviceChange,
+        events.Gap,
+        events.SelfTestRun,
+        events.Command,
+        events.Pruned,
+        events.Tick,
+    ):
         yield from [f"## Event `{kind.__name__}`", "", _flat(kind.__doc__), "", *_fields(kind, set())]
     yield from ["## The guide of fieldcal bench", "", _flat(guide.Guide.__doc__), ""]
     yield from [

@@ -463,6 +463,20 @@ class I2cContract(SensorContract):
         assert "may be dead" in faults[1]
 
     @on_one_adapter
+    def test_phases_of_the_self_test_take_turns(self, rig: I2cRig) -> None:
+        rig.put(rig.twin_class(lambda first, n: np.zeros((n, 3), np.int32) + 0 * first, rig.due, lambda: rig.t_s))
+        info = rig.sensor.open()
+        test = rig.sensor.begin_self_test()
+        off, on, again, once_more = (rig.sensor.self_test_phase(on=on).mean_g for on in (False, True, False, True))
+        assert (off, on) == (again, once_more)
+        change = np.subtract(on, off)
+        assert np.all((np.array(test.low_g) <= change) & (change <= np.array(test.high_g)))
+        assert rig.sensor.open() == info
+        block = rig.sensor.read_block()
+        assert block is not None
+        assert not block.indications.any()
+
+    @on_one_adapter
     @pytest.mark.parametrize("seed", range(FOREIGN_ACCESSES))
     def test_what_another_program_writes_is_noticed(self, rig: I2cRig, seed: int) -> None:
         rng = np.random.default_rng(seed)

@@ -101,9 +101,10 @@ class Adxl355Twin(FifoTwin):
         *,
         identity: bytes | None = None,
         temperature_raw: Callable[[float], int] | None = None,
+        electrostatic: Callable[[float], NDArray[np.float64]] | None = None,
     ) -> None:
         self._identity = identity or self.own_identity
-        super().__init__(source, samples_due, clock, temperature_raw=temperature_raw)
+        super().__init__(source, samples_due, clock, temperature_raw=temperature_raw, electrostatic=electrostatic)
         self._ready_s = clock()  # the device has had power for a long time
 
     def power_cycle(self) -> None:

@@ -24,6 +24,7 @@ class FifoTwin(ABC):
     - `samples_due(t_s)`: number of samples that exist at `t_s`.
     - `clock()`: the present time t_s, s.
     - `temperature_raw(t_s)`: raw temperature value of the chip.
+    - `electrostatic(t_s)`: factor (3,) of the deflection by the self-test, as supply and temperature are then.
 
     Samples are counted while the FIFO is off, too, but only samples made while it is on go into it.
     """
@@ -43,11 +44,13 @@ class FifoTwin(ABC):
         clock: Callable[[], float],
         *,
         temperature_raw: Callable[[float], int] | None = None,
+        electrostatic: Callable[[float], NDArray[np.float64]] | None = None,
     ) -> None:
         self._source = source
         self._samples_due = samples_due
         self._clock = clock
         self._temperature_raw = temperature_raw or (lambda _: self.temperature_at_25_degc)
+        self._electrostatic = electrostatic or (lambda _: np.ones(3))
         self._failures: list[int] = []
         self._latched: Counts | None = None
         self._broken_off: tuple[int, int] | None = None
@@ -90,6 +93,13 @@ class FifoTwin(ABC):
         """Change (3,) of the counts by the self-test."""
         return np.zeros(3, np.int32)
 
+    def _deflected(self, counts: Counts) -> Counts:
+        """Counts (n, 3) with what the self-test adds now."""
+        deflection = self._deflection()
+        if not deflection.any():
+            return counts
+        return counts + np.rint(deflection * self._electrostatic(self._clock())).astype(np.int32)
+
     @property
     def response(self) -> Response:
         """What its filters, as the registers set them, make of a motion; `source` has to pass the motion through."""
@@ -99,7 +109,7 @@ class FifoTwin(ABC):
         """Contents (3,) of the output registers: the newest sample; it does not change within one I2C message."""
         if self._latched is None:
             due = self._samples_due(self._clock())
-            self._latched = self._source(due - 1, 1)[0] + self._deflection() if due else np.zeros(3, np.int32)
+            self._latched = self._deflected(self._source(due - 1, 1))[0] if due else np.zeros(3, np.int32)
         return self._latched
 
     def power_cycle(self) -> None:
@@ -192,7 +202,7 @@ class FifoTwin(ABC):
             return
         room = self.fifo_bytes // self.sample_bytes + 1  # one sample more than the FIFO holds, to detect an overflow
         first = max(self._next, due - room)
-        self._fifo += self._encode(first, self._source(first, due - first) + self._deflection())
+        self._fifo += self._encode(first, self._deflected(self._source(first, due - first)))
         self._next = due
         if len(self._fifo) > self.fifo_bytes:
             self._overrun = True

@@ -7,13 +7,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from agent.cli.fleet import fleet
-from agent.core.events import RunStart, Tick, WatchReport
+from agent.core.events import RunStart, SelfTestReport, Tick, WatchReport
 from agent.recording.writer import Recorder
+from agent.site_watch.day_sum import days_of
+from agent.site_watch.files import from_files
+from agent.site_watch.hour import TWICE
 from tests.unit.mounted_site import site_config
 
 HOUR_NS = 3_600_000_000_000
@@ -91,6 +95,7 @@ def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, cl
     assert again.exception is None
     after = json.loads(again.stdout)
     assert sum(after["left_out"].values()) == 15
+    assert after["left_out"][TWICE] == 1, "all others are refused by themselves"
     assert after["lines"] == len(hostile)
     by_name = {one["sensor"]: one for one in after["sensors"]}
     for one in found["sensors"]:
@@ -201,9 +206,56 @@ def test_a_visit_says_what_it_found_where_the_calibrations_are_told(
     assert refuted["sensors"][5]["least_detectable_pct"][0] > 1.2 * told["sensors"][5]["least_detectable_pct"][0]
 
 
+def self_test(row: dict[str, Any], sequence: int) -> SelfTestReport:
+    """A self-test in the middle of the hour of a row; x fails, and y changes with the day."""
+    y = 5.0 + 0.01 * (row["hour_utc_ns"] // (24 * HOUR_NS) % 7)
+    return SelfTestReport(
+        run_id="run", sequence=sequence, sensor=row["sensor"], t_utc_ns=row["hour_utc_ns"] + HOUR_NS // 2, reason="",
+        response_mps2=[float("nan"), -y, 12.0], u_response_mps2=[float("nan"), 0.005, 0.012], u_supply_pct=[2.0] * 3,
+        pairs=6, motion_mps2=[0.03] * 3, temperature_degc=row["temperature_degc"], faults=[],
+    )  # fmt: skip
+
+
+def test_self_tests_of_a_day(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    few = [row for row in clean if row["sequence"] < 48]
+    night = [row for row in few if row["sequence"] == 27 and row["sensor"] in "ad"]
+    tests = [as_line(self_test(row, 300), row["gateway"]) for row in night]
+    tests[1]["temperature_degc"] = None
+    earlier = tests[0] | {"sequence": 299, "response_mps2": [1.0] * 3}
+    wrong = [{"response_mps2": []}, {"response_mps2": [1e9, 0.0, None]}, {"temperature_degc": 1e3}]
+    hostile = [tests[1] | {"sequence": 301 + k, "sensor": "b", "gateway": "north"} | one for k, one in enumerate(wrong)]
+    file = tmp_path / "hours.jsonl"
+    file.write_text("\n".join(map(json.dumps, [*tests, *few, earlier, *hostile])))
+    source = from_files([file])
+    assert (source.lines, source.left_out) == (len(few), {})
+    none, told = source.sums()
+    assert none.self_test == b""
+    at = [told.sensors.index(i) for i, who in zip(source.numbers, source.sensors, strict=True) if who[1] in "ad"]
+    response = told.array("self_test")
+    assert np.flatnonzero(np.isfinite(response).any(axis=1)).tolist() == sorted(at)
+    y = 5.0 + 0.01 * (20_001 % 7)
+    assert response[at[0]] == pytest.approx([np.nan, np.log(y), np.log(12.0)], nan_ok=True)
+    assert told.array("self_test_u")[at[0]] == pytest.approx([np.nan, 0.005 / y, 0.001], nan_ok=True)
+    assert told.array("self_test_supply")[at[0]] == pytest.approx([0.02] * 3)
+    degc = told.array("self_test_degc")[at]
+    assert degc == pytest.approx([night[0]["temperature_degc"], np.nan], nan_ok=True)
+    *_, day = days_of(source.sums(), source.numbers, source.bands)
+    assert day.day.self_tests is not None
+    assert np.array_equal(
+        np.isfinite(day.day.self_tests.log_response[:, 1]), [who[1] in "ad" for who in source.sensors]
+    )
+
+
+def as_line(result: SelfTestReport, gateway: str) -> dict[str, Any]:
+    """The result as a line of JSON has it."""
+    return dict(msgspec.json.decode(msgspec.json.encode(result)) | {"gateway": gateway})
+
+
 def test_recordings_say_the_same_as_lines(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     few = [row for row in clean if row["sequence"] < 24 * 3]
-    lines_said = json.loads(run(tmp_path, few, "--json", "-").stdout)
+    tests = [as_line(self_test(row, row["sequence"]), row["gateway"]) for row in few if row["sequence"] % 24 == 3]
+    lines_said = json.loads(run(tmp_path, few + tests, "--json", "-").stdout)
+    of_lines = list(from_files([tmp_path / "hours.jsonl"]).sums())
     paths = []
     for gateway in ("north", "middle", "south"):
         recorder = Recorder(tmp_path / gateway, [], [])
@@ -216,7 +268,8 @@ def test_recordings_say_the_same_as_lines(tmp_path: Path, clean: list[dict[str, 
         recorder.record(0, start, [])
         for number, row in enumerate((row for row in few if row["gateway"] == gateway), start=1):
             t_utc_ns = row["hour_utc_ns"] + HOUR_NS
-            assert recorder.record(number, Tick(t_monotonic_ns=number, t_utc_ns=t_utc_ns), [report(row, number)])
+            results = [report(row, number), *([self_test(row, number)] if row["sequence"] % 24 == 3 else [])]
+            assert recorder.record(number, Tick(t_monotonic_ns=number, t_utc_ns=t_utc_ns), results)
         assert recorder.path is not None
         path = recorder.path
         recorder.close()
@@ -227,6 +280,10 @@ def test_recordings_say_the_same_as_lines(tmp_path: Path, clean: list[dict[str, 
     assert found == lines_said | {"sensors": found["sensors"]}
     assert {one["sensor"] for one in found["sensors"]} == set("abcdef")
     assert [one["days"] for one in found["sensors"]] == [3] * 6
+    for one, other in zip(from_files([Path(path) for path in paths]).sums(), of_lines, strict=True):
+        assert np.isfinite(one.array("self_test")[:, 1]).all()
+        # The response of y follows the day alone, so it is one for all sensors, in whatever order they stand.
+        assert np.array_equal(one.array("self_test"), other.array("self_test"), equal_nan=True)
     torn = Path(paths[0]).read_bytes()
     Path(paths[0]).write_bytes(torn[: len(torn) // 2])
     again = CliRunner().invoke(fleet, ["watch", *paths], standalone_mode=False)

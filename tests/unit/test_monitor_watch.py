@@ -25,7 +25,7 @@ from agent.monitor.watch_store import KEPT_DAYS, close_day, packed, source_of, u
 from agent.site_watch.hour import TWICE, WatchHour
 from tests.unit.postgres import postgres
 from tests.unit.results import calibration, status
-from tests.unit.test_fleet_watch import FIRST_H, HOUR_NS, lines
+from tests.unit.test_fleet_watch import FIRST_H, HOUR_NS, lines, self_test
 from tests.unit.test_monitor_database import engine_of
 
 NOW_NS = (FIRST_H + 24 * 45) * HOUR_NS
@@ -128,6 +128,25 @@ def test_the_monitor_says_what_the_files_say_and_what_it_said_lasts(tmp_path: Pa
         assert fleet.alarms() == []
 
 
+def test_self_tests_are_in_the_sum_of_their_day(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
+    few = [row for row in rows if row["sequence"] < 24 * 3 and row["gateway"] == "north"]
+    database = Database(engine, now_ns=lambda: NOW_NS)
+    got = [received(row) for row in few]
+    for row in few:
+        if row["sequence"] in (3, 27) and row["sensor"] == "b":
+            result = self_test(row, 1000 + row["sequence"])
+            fields = msgspec.json.decode(msgspec.json.encode(result))
+            got.append(Received("", Address("bridge", "north", "b", "self_test"), result.sequence, fields, None))
+    database.add(got)
+    while close_day(database.query):
+        pass
+    sums = list(source_of(database.query, "bridge", closed=True).sums())
+    told = [one.array("self_test") for one in sums]
+    assert [np.isfinite(each[:, 2]).tolist() for each in told] == [[False, True]] * 2
+    y = [5.0 + 0.01 * (20_000 % 7), 5.0 + 0.01 * (20_001 % 7)]
+    assert np.exp([each[1, 1] for each in told]) == pytest.approx(y)
+
+
 def test_hostile_hours_are_counted_and_change_nothing(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     few = rows[: 6 * 24 * 3]
     with closing(Sqlite(tmp_path / "monitor.sqlite")) as engine:
@@ -203,6 +222,9 @@ def test_a_damaged_day_and_a_damaged_hour_are_left_out(tmp_path: Path, rows: lis
         found = list(source_of(database.query, "bridge", closed=True).sums())
         assert [one.number - FIRST_H // 24 for one in found] == [0, 2]
         assert [len(one.sensors) for one in found] == [5, 6]
+        short = msgspec.msgpack.encode(msgspec.structs.replace(found[1], value=found[1].value[:-4]))
+        database.query("UPDATE watch_day SET payload = :p WHERE day = :d", p=short, d=FIRST_H // 24 + 2)
+        assert len(list(source_of(database.query, "bridge", closed=True).sums())) == 1
 
 
 def test_what_a_database_is_not(tmp_path: Path, rows: list[dict[str, Any]]) -> None:

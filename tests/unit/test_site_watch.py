@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 import pytest
 
 from calib.model import Array
-from calib.site_watch.day import Day, Hours, Visits, day_of
+from calib.site_watch.day import Day, Hours, SelfTests, Visits, day_of
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR, TERMS, Steps, inverted
 from calib.site_watch.together import ALL, DIRECTIONS, design, jointly
@@ -151,6 +152,7 @@ def test_one_sensor_is_named_with_size_and_date(learned: tuple[Site, SiteWatch])
     assert told.what == "sensitivity of z"
     assert abs(told.size + 0.01) < told.U < 0.006
     assert told.earliest <= 20_060 <= told.latest
+    assert abs(told.since - 20_060) <= 2
     assert not found.gateways
 
 
@@ -258,7 +260,10 @@ def test_sound_sites_are_left_alone() -> None:
 
 
 def test_the_limit_grows_with_the_number_of_tests() -> None:
-    assert 4.0 < limit_of(8, 3) < limit_of(30, 5) < limit_of(200, 10) < 5.5
+    """Of a sensor seven directions, three noise floors and its bands; half an alarm a year in 1,000 looks at each."""
+    for sensors, gateways in ((8, 3), (30, 5), (200, 10)):
+        tests = 11 * sensors + gateways
+        assert limit_of(sensors, gateways) == pytest.approx(NormalDist().inv_cdf(1.0 - 0.25 / (1000.0 * tests)))
 
 
 def test_a_watch_goes_on_from_its_snapshot_bit_for_bit() -> None:
@@ -414,3 +419,50 @@ def test_gravity_is_asked_at_the_date_of_the_change(learned: tuple[Site, SiteWat
     assert abs(says[0]["gravity"].size + 0.03) < 3.0 * says[0]["gravity"].u < 0.01
     assert abs(says[1]["gravity"].size) < 3.0 * says[1]["gravity"].u
     assert says[0]["noise"].says == "silent"
+
+
+def test_the_self_test_is_asked_at_the_date_of_the_change_at_the_temperature_of_its_nights(
+    learned: tuple[Site, SiteWatch],
+) -> None:
+    """x of sensors 4 and 6 loses 3 %; the response of sensor 4 with it. All responses follow the temperature of their
+    night by 0.2 %/K, each axis otherwise, and the supply by 1 % from night to night; that of sensor 6 falls by 4 % at
+    the same date. Sensor 2 has none, and sensor 6 has not every night.
+    """
+    site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
+    random = np.random.default_rng(5)
+    change[[2, 4, 6], 0] = -0.03
+    for k in range(40):
+        day = site.day(change if k >= 28 else None)
+        T = (15.0 + random.normal(0.0, 6.0, 9) - 10.0) / 10.0
+        warmed = np.outer(T, [0.02, -0.02, 0.01]) + np.outer(T**2, [0.03, 0.0, -0.03])
+        shown = 1.0 + warmed + random.normal(0.0, 0.001, (9, 3))
+        shown += random.normal(0.0, 0.02, (9, 1))
+        if k >= 28:
+            shown[4, 0] -= 0.03
+            shown[6] -= 0.08
+        shown[2] = np.nan
+        if k % 5 == 2:
+            shown[6] = np.nan
+        tests = SelfTests(shown, np.full((9, 3), 5e-4), np.full((9, 3), 0.01), 10.0 + 10.0 * T)
+        watch.update(replace(day, self_tests=tests))
+    again = SiteWatch.loaded(watch.snapshot())
+    for one in (result(watch), result(again)):
+        told = {
+            i: {w.name: w for w in sensor.witnesses} for i, sensor in enumerate(one.sensors) if sensor.kind != "none"
+        }
+        assert list(told) == [2, 4, 6]
+        assert "self-test" not in told[2]
+        says = told[4]["self-test"], told[6]["self-test"]
+        assert [one.says for one in says] == ["agrees", "contradicts"]
+        assert abs(says[0].size + 0.03) < 3.0 * says[0].u < 0.01
+        assert abs(says[1].size) < 3.0 * says[1].u < 0.025
+
+
+def test_a_visit_begins_the_history_of_the_self_test_anew(learned: tuple[Site, SiteWatch]) -> None:
+    site, watch = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot())
+    tests = SelfTests(np.ones((9, 3)), np.full((9, 3), 1e-3), np.full((9, 3), 0.02), np.full(9, 10.0))
+    for _ in range(5):
+        watch.update(replace(site.day(), self_tests=tests))
+    there = np.arange(9) == 3
+    watch.update(replace(site.day(), self_tests=tests), Visits.unknown(there))
+    assert watch.self_tests.days.reshape(9, 3)[:, 0].tolist() == [0.0 if visited else 6.0 for visited in there]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from agent.site_watch.source import WatchError
 from agent.site_watch.suspicion import Suspicion, sentence, suspicion_of
 from calib.model import PARAMETERS
 from calib.site_watch.verdicts import SensorVerdict
-from calib.site_watch.witnesses import Witness, gravity, noise
+from calib.site_watch.witnesses import Witness, gravity, noise, self_test, supply_basis
 from tests.unit.recorded_bench import EPOCH_NS, record
 from tests.unit.results import calibration
 
@@ -96,6 +97,39 @@ def test_what_gravity_and_noise_say() -> None:
     assert noise(4, np.full(3, 0.3), np.full(3, 0.05)).says == "silent", "noise keeps its axes in a turn"
 
 
+def test_what_the_self_test_says() -> None:
+    u, supply = np.full(3, 0.002), np.full(3, 0.02)
+    own, common = 0.002**2 + (0.1 * 0.02) ** 2, 3.0 * 0.02**2  # variance across and along what the supply does
+
+    def said(direction: int, size: float, step: Any, u_step: Any = u, u_supply: Any = supply) -> Witness:
+        return self_test(direction, size, 0.0015, supply_basis(u_supply[None])[0] @ step, u_step, u_supply)
+
+    # One axis: it is seen against the others, whatever the supply has done to all of them.
+    yes = said(0, -0.011, np.array([-0.013, 0.0, 0.0]) + 0.001)
+    assert (yes.says, yes.u) == ("agrees", pytest.approx((2.0 / 3.0 / own + 1.0 / 3.0 / (own + common)) ** -0.5))
+    assert said(0, -0.011, np.array([-0.013, 0.0, 0.0]) + 0.05).size == pytest.approx(-0.013, abs=0.001)
+    assert said(0, -0.011, np.full(3, 0.05)).says == "contradicts"
+    # All axes: no more than the supply lets be seen.
+    assert said(3, -0.011, np.full(3, -0.011)).says == "silent"
+    both = said(3, -0.06, np.full(3, -0.06))
+    assert (both.says, both.u) == ("agrees", pytest.approx(np.sqrt((own + common) / 3.0)))
+    assert said(3, -0.06, np.zeros(3)).says == "contradicts"
+    assert said(3, -0.06, np.full(3, 0.06)).says == "contradicts", "it has risen"
+    # An ADXL345: the supply changes x and y more than z, so that all axes alike is another thing.
+    uneven = np.array([0.0206, 0.0206, 0.0139])
+    assert said(3, -0.02, np.full(3, -0.02), u, uneven).says == "agrees"
+    assert said(3, -0.02, uneven, u, uneven).says == "contradicts"
+    # Neither as large as the structure tells nor none: nothing is said against it.
+    assert said(0, -0.011, np.array([-0.006, 0.0, 0.0])).says == "silent"
+    # Another size of the same sign: how much of a change the response shows is not known.
+    assert said(0, -0.011, np.array([-0.03, 0.0, 0.0])).says == "agrees"
+    assert said(5, 0.02, np.full(3, 0.02)).says == "silent", "a turn moves nothing within the sensor"
+    assert said(0, -0.011, np.zeros(3), np.array([np.inf, 0.002, 0.002])).says == "silent", "too few nights"
+    assert self_test(0, -0.011, 0.0015, np.zeros(3), u, np.full(3, np.nan)).says == "silent"
+    steady = said(3, -0.011, np.full(3, -0.011), u, np.zeros(3))
+    assert (steady.says, steady.u) == ("agrees", pytest.approx(0.002 / np.sqrt(3.0)))
+
+
 def test_the_sentence_names_each_witness() -> None:
     told = SensorVerdict(
         "sensitivity", "sensitivity of x", np.log1p(-0.011), 0.003, DAY, DAY - 2, DAY + 1, 4.1, 0,
@@ -105,6 +139,10 @@ def test_the_sentence_names_each_witness() -> None:
         "sensitivity of x has fallen by 1.10 ± 0.30 % since 2023-11-14 ± 2 d: the structure says so (4.1 u), "
         "gravity is silent, noise is silent"
     )
+    told = replace(told, witnesses=(Witness("self-test", "agrees", -0.013, 0.004),))
+    assert sentence(told).endswith(": the self-test says so (3.2 u)")
+    told = replace(told, witnesses=(Witness("self-test", "contradicts", 0.001, 0.002),))
+    assert sentence(told).endswith(": the self-test contradicts it (+0.10 % ± 0.40 %)")
 
 
 def test_files_of_verdicts_that_cannot_be_used(tmp_path: Path) -> None:
@@ -117,7 +155,8 @@ def test_files_of_verdicts_that_cannot_be_used(tmp_path: Path) -> None:
 
     assert "not a result of `fieldcal fleet watch --json`" in refused(b"{}")
     assert "not a result of" in refused(b"\xff\x00")
-    for wrong in ({"size": 1e9}, {"axes": "w"}, {"axes": "xyz", "turn": True}, {"since": "tomorrow"}):
+    sizes, words = [{"size": 10.0}, {"expanded_uncertainty": -11.0}], [{"axes": "w"}, {"since": "tomorrow"}]
+    for wrong in (*sizes, *words, {"axes": "xyz", "turn": True}):
         assert "gw/mems" in refused(verdicts(tmp_path / "v", suspicion(**wrong)).read_bytes())
     two = verdicts(tmp_path / "two", suspicion(), suspicion(gateway="other"))
     with pytest.raises(WatchError, match="2 gateways have a suspected sensor mems"):

@@ -9,7 +9,7 @@ const sized = (s) => (s.turn ? `${rounded(Math.abs(DEG * s.size), DEG * s.expand
 const ofAxes = (axes) => (axes === "xyz" ? "x, y and z" : axes);
 
 function witness(w, turn) {
-  const who = w.name === "structure" ? "the structure" : w.name, percent = (v) => TOLD_PCT * v;
+  const who = ["structure", "self-test"].includes(w.name) ? `the ${w.name}` : w.name, percent = (v) => TOLD_PCT * v;
   if (w.says === "silent") return `${who} is silent`;
   if (w.name === "noise") return `the noise has changed too (${signed(percent(w.size), percent(w.expanded_uncertainty))} %)`;
   if (w.says === "contradicts") return `${who} contradicts it${turn ? "" : ` (${signed(percent(w.size), percent(w.expanded_uncertainty))} % ± ${two(percent(w.expanded_uncertainty))} %)`}`;
@@ -19,10 +19,10 @@ function witness(w, turn) {
 // {say, more} of a sensor that is suspected.
 export function suspectedWords({ suspected: s }) {
   const change = s.turn ? ["Turned about ", s.axes, " by ", make("b", sized(s))] : ["Sensitivity of ", ofAxes(s.axes), s.size < 0 ? " fell by " : " rose by ", make("b", sized(s))];
-  const heard = s.witnesses.map((w) => witness(w, s.turn)).join(", "), contradicted = s.witnesses.some((w) => w.says === "contradicts");
+  const heard = s.witnesses.map((w) => witness(w, s.turn)).join(", "), says = (what) => s.witnesses.slice(1).some((w) => w.says === what), contradicted = says("contradicts"), agreed = says("agrees");
   return {
     say: ["Suspected: ", ...change, " since ", ...when(s), "."],
-    more: [heard ? `${heard[0].toUpperCase()}${heard.slice(1)}. ` : "All sensors of its gateway have changed alike. ", contradicted ? "So rather the structure at the sensor, or its mount, has changed." : s.witnesses.slice(1).some((w) => w.says === "agrees") ? "So the sensor itself has changed." : "The sensor has changed, or the structure at it moves otherwise in all bands alike."],
+    more: [heard ? `${heard[0].toUpperCase()}${heard.slice(1)}. ` : "All sensors of its gateway have changed alike. ", contradicted && !agreed ? "So rather the structure at the sensor, or its mount, has changed." : agreed && !contradicted ? "So the sensor itself has changed." : "The sensor has changed, or the structure at it moves otherwise in all bands alike."],
   };
 }
 
