@@ -222,7 +222,8 @@ def test_self_tests_of_a_day(tmp_path: Path, clean: list[dict[str, Any]]) -> Non
     tests = [as_line(self_test(row, 300), row["gateway"]) for row in night]
     tests[1]["temperature_degc"] = None
     earlier = tests[0] | {"sequence": 299, "response_mps2": [1.0] * 3}
-    wrong = [{"response_mps2": []}, {"response_mps2": [1e9, 0.0, None]}, {"temperature_degc": 1e3}]
+    wrong: list[dict[str, Any]] = [{"response_mps2": one} for one in ([], [1e9, 0.0, None])]
+    wrong.append({"temperature_degc": 1e3})
     hostile = [tests[1] | {"sequence": 301 + k, "sensor": "b", "gateway": "north"} | one for k, one in enumerate(wrong)]
     file = tmp_path / "hours.jsonl"
     file.write_text("\n".join(map(json.dumps, [*tests, *few, earlier, *hostile])))

@@ -155,8 +155,11 @@ def test_files_of_verdicts_that_cannot_be_used(tmp_path: Path) -> None:
 
     assert "not a result of `fieldcal fleet watch --json`" in refused(b"{}")
     assert "not a result of" in refused(b"\xff\x00")
-    sizes, words = [{"size": 10.0}, {"expanded_uncertainty": -11.0}], [{"axes": "w"}, {"since": "tomorrow"}]
-    for wrong in (*sizes, *words, {"axes": "xyz", "turn": True}):
+    each: list[dict[str, Any]] = [
+        {"size": 10.0}, {"expanded_uncertainty": -11.0}, {"axes": "w"}, {"since": "tomorrow"},
+        {"axes": "xyz", "turn": True},
+    ]  # fmt: skip
+    for wrong in each:
         assert "gw/mems" in refused(verdicts(tmp_path / "v", suspicion(**wrong)).read_bytes())
     two = verdicts(tmp_path / "two", suspicion(), suspicion(gateway="other"))
     with pytest.raises(WatchError, match="2 gateways have a suspected sensor mems"):
