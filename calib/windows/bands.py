@@ -14,7 +14,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
 
 from calib.model import Array, BandSums, Window, own_channels
 from calib.signal.band import hanning
@@ -73,7 +72,7 @@ def band_sums(u: Array, du: Array, V: Array, rate_hz: float, share: float = TAPE
 
 def _leaking(power: Array, n: int, share: float) -> Array:
     """(L,) what of the power (L,) of the lines of n points leaks from other lines at most, for `_taper(n, share)`."""
-    size = next_fast_len(2 * len(power), real=True)
+    size = 1 << (2 * len(power)).bit_length()
     return np.asarray(np.fft.irfft(np.fft.rfft(power, size) * _leak(len(power), n, share), size)[: len(power)])
 
 
@@ -85,7 +84,7 @@ def _leak(lines: int, n: int, share: float) -> Complex:
     lobes = np.abs(np.fft.rfft(taper, 2 * n)) ** 2
     envelope = np.maximum.accumulate(lobes[::-1])[::-1][: 2 * lines : 2] / lobes[0]
     envelope[:NEAR_LINES] = 0.0
-    around = np.zeros(next_fast_len(2 * lines, real=True))
+    around = np.zeros(1 << (2 * lines).bit_length())
     around[: len(envelope)] = np.where(envelope > LEAST_LEAK, envelope, 0.0)
     around[1:] += around[:0:-1].copy()
     spectrum = np.fft.rfft(around)

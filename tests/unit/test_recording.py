@@ -104,6 +104,7 @@ def test_other_readers_see_topics_times_and_numbers(tmp_path: Path) -> None:
             "/bridge-1/status",
             "/bridge-1/clock",
             "/bridge-1/watch",
+            "/bridge-1/self_test",
         }
         messages = list(make_reader(file, validate_crcs=True).iter_messages(topics="/acc/raw"))
     blocks = [(number, event) for number, event, _ in recorded if getattr(event, "device", "") == "acc"]
