@@ -5,8 +5,7 @@
 All is simulated; no device has been seen. Each device stands on a structure that sways (SWAY_MPS2, 0.5 to 3 Hz), and
 tests itself each night through its driver and its twin. Its response follows the temperature by its own coefficients
 and the supply voltage with a power near that of the data sheet. The supply depends on the temperature and wanders.
-After
-LEARNED nights and WEEK more, the watch asks the self-test of a change that began a week ago. A change of the
+After LEARNED nights and WEEK more, the watch asks the self-test of a change that began a week ago. A change of the
 sensitivity multiplies all indications, so it is put into the responses of the last week.
 """
 

@@ -138,8 +138,8 @@ def correlated_lag(
     taken one by one, so that those of a day need not be held. Lags up to `furthest_s` to both sides and changes up to
     `most_rate` are compared; `omega` is the angular frequency of the motion in rad/s.
     Where several peaks are almost equally high, as in motion of one frequency, that of the slowest change counts, and
-    of these the one nearest to 0. None if there is no motion. The lag is right to a sample, or to an eighth of a period
-    at both ends of the parts; `without_lag` leads from there to the lag.
+    of these the one nearest to 0. None if there is no motion. The lag is right to a sample over FINER, or to an eighth
+    of a period at both ends of the parts where the clocks run apart; `without_lag` leads from there to the lag.
     """
     every, reach_s = max(1, int(np.ceil(span_s / (PIECE_S * MOST_PIECES)))), furthest_s + 0.5 * most_rate * span_s
     step_s, middles, correlations = 0.0, [], []
