@@ -23,6 +23,7 @@ from benchmarks.online.life import MAIN, House
 from benchmarks.online.node import adxl355
 from calib.geometry import AXES
 from calib.model import Array
+from hw.block import DeviceInfo, SampleBlock
 from hw.virtual.building import DAY_S, Building, BuildingDevice, BuildingParameters, BuildingTruth, Weather
 from hw.virtual.building_motion import BuildingMotion, ComplexArray
 from hw.virtual.harm import Harm, Visit
@@ -65,10 +66,11 @@ CUT = (10.3, 10.42)  # days between which there is no power
 STILL_NIGHTS, STILL_HOURS, STILL = (3, 11, 20), range(1, 5), 0.02  # of the wind's level; no lorry
 QUAKE, QUAKE_MPS2, QUAKE_HZ = 27 * 24 + 15, 12.0, (0.7, 6.0)  # visit, largest rms, band; it lasts for some 20 s
 SHOCK, TURN_DEG, SHIFT_S = 0.005, 0.3, 0.012
-REFERENCES, SENSORS = ("DC", "AC"), ("ADXL355", "12 bits")
+REFERENCES, SENSORS = ("DC", "AC", "vertical"), ("ADXL355", "12 bits")
 DIGIT_MPS2, NOISE_OF_12_BITS_MPS2 = 0.00980665, 0.02  # 1 mg a digit; 200 ug a root hertz at 100 Hz
 Job = tuple[str, str, int]  # reference, sensor, seed
 CORNER_HZ = 0.05
+TRANSVERSE_PCT = 50.0  # motion across, over the vertical one, as a vertical reference is told
 
 
 class Moved:
@@ -83,11 +85,24 @@ class Moved:
 
 
 class Bridge(Building):
-    """The bridge; `parameters.weather` is the thermometer's, and S depends on the body by `s_per_k`."""
+    """The bridge; `parameters.weather` is the thermometer's, and S depends on the body by `s_per_k`. A `vertical`
+    reference has one axis."""
 
-    def __init__(self, parameters: BuildingParameters, seed: int, harm: Harm, s_per_k: float) -> None:
+    def __init__(
+        self, parameters: BuildingParameters, seed: int, harm: Harm, s_per_k: float, vertical: bool = False
+    ) -> None:
         super().__init__(parameters, seed, harm)
-        self._s_per_k = s_per_k
+        self._s_per_k, self._vertical = s_per_k, vertical
+
+    def infos(self) -> dict[str, DeviceInfo]:
+        told = super().infos()
+        return told | {"reference": replace(told["reference"], axes=1)} if self._vertical else told
+
+    def visit(self, visit: int) -> list[SampleBlock]:
+        blocks = super().visit(visit)
+        if not self._vertical:
+            return blocks
+        return [replace(b, indications=np.ascontiguousarray(b.indications[:, 2:])) if b.device == "reference" else b for b in blocks]
 
     def truth(self, time_s: float) -> BuildingTruth:
         told, mean = super().truth(time_s), self.parameters.weather.mean_degc
@@ -128,7 +143,7 @@ class Bridge(Building):
         lines: ComplexArray = np.zeros((len(frequency_hz), 3), dtype=np.complex128)
         for (natural_hz, damping, shape), force in zip(MODES, forces, strict=True):
             s = 1j * frequency_hz / natural_hz
-            lines += (s**2 / (s**2 + 2.0 * damping * s + 1.0) * np.fft.rfft(force))[:, None] * np.array(shape)
+            lines += (s**2 / (s**2 + 2.0 * damping * s + 1.0) * np.fft.rfft(force))[:, None] * np.roll(shape, -1)
         if visit == QUAKE:
             lines += np.fft.rfft(_quake(random, time_s), axis=0)
         if response is not None:
@@ -236,7 +251,7 @@ class World:
         return np.append((turn @ S).ravel(), turn @ Q)
 
 
-def world(seed: int, reference: str, sensor: str = SENSORS[0]) -> World:
+def world(seed: int, reference: str, sensor: str = SENSORS[0], transverse_pct: float = TRANSVERSE_PCT) -> World:
     """Draw everything from the seed. The configuration states what an operator knows, and no walks."""
     random = np.random.default_rng([seed, 5])
     axis = random.standard_normal(3)
@@ -264,11 +279,18 @@ def world(seed: int, reference: str, sensor: str = SENSORS[0]) -> World:
     )  # fmt: skip
     digit = DIGIT_MPS2 if sensor == SENSORS[1] else 0.0
     harm, s_per_k = Happens("what happens", turn=turn, digit_mps2=digit), 1e-4 * random.uniform(0.3, 1.0)
-    made = Bridge(parameters, seed, harm, s_per_k)
-    later = Bridge(replace(parameters, reference_sensitivity=_reads(random)), seed, harm, s_per_k)
+    vertical = reference == "vertical"
+    made = Bridge(parameters, seed, harm, s_per_k, vertical)
+    later = Bridge(replace(parameters, reference_sensitivity=_reads(random)), seed, harm, s_per_k, vertical)
     corner = {"corner_hz": CORNER_HZ, "u_corner_hz": 0.05 * CORNER_HZ} if reference == "AC" else {}
     prior = {"sensitivity": 1.0, "u_main_pct": 1.5, "u_transverse_pct": 0.75, "u_offset_mps2": 0.3}
-    config = building_config(made, prior=prior, certificate={"u_sensitivity_pct": 0.1} | corner)
+    keys: dict[str, Any] = {"prior": prior, "certificate": {"u_sensitivity_pct": 0.1} | corner}
+    if vertical:
+        pose = {"direction": [0.0, 0.0, 1.0], "gravity_mps2": [0.0, 0.0, STANDARD_GRAVITY_MPS2]}
+        always = {"start_s": 0.0, "stop_s": 1e9}
+        unknown = {"rotation": None, "rotation_gravity_mps2": None}
+        keys |= {"poses": [pose | always], "uncertainty": {"transverse_motion_pct": transverse_pct}} | unknown
+    config = building_config(made, **keys)
     return World(made, later, config, turn)
 
 

@@ -19,7 +19,7 @@ from calib.estimate.quantities import (
     YEAR_DAYS,
     offset_temperature,
 )
-from calib.estimate.statements import FLAT
+from calib.estimate.statements import FLAT, Statements
 from calib.estimate.unknowns import Unknowns
 from calib.model import Array, own_channels
 from calib.windows.condense import regressed
@@ -123,6 +123,7 @@ class Degrees:
 
 
 TYPE_A, OFFSETS, LAGS = "type A", "offset between windows", "lag between windows"
+BESIDE = "transverse motion between windows"
 CORRECTION, UNSEEN = "correction for the reference's noise", "directions without motion"
 
 
@@ -251,6 +252,7 @@ class _Slopes:
         self._degrees = degrees.moved(windows.told_degc, by_S)
         self._walked = windows.moved[:, :, None, :] * walks[:, None] / own.noise[:, None, :, None]
         drifted = np.sqrt(self._stretch / YEAR_DAYS) * [p.of(REFERENCE_DRIFT.prior) for p in priors]
+        self._beside = _beside_one_axis(windows, s, np.array([p.transverse for p in priors]) / np.sqrt(merged))
         by_channel = _by_channel(windows).reshape(len(records), n, own_channels(windows.channels))
         self._drifted = by_channel * drifted[:, None, None]
         self._noise = np.tile(own.noise, n // 3)
@@ -260,7 +262,8 @@ class _Slopes:
         """(W, 6M, 6M) that of the root of the covariance, in units of the noise of a point."""
         one = np.eye(self._missed.shape[1])
         covariance = self._white[:, None, None] * one + self._missed[..., None] ** 2 * one
-        covariance = covariance + self._loaded @ self._loaded.mT + self._degrees @ self._degrees.mT
+        for scatter in (self._loaded, self._degrees, self._beside):
+            covariance = covariance + scatter @ scatter.mT
         if self._stretch.any():
             for i in range(3):
                 each = self._walked[:, :, i]
@@ -278,8 +281,34 @@ class _Slopes:
             CORRECTION: by_load[:, 1].sum(axis=0), UNSEEN: ((self._missed[..., None] * moved) ** 2).sum(axis=(0, 1)),
             WALK: self._stretch @ by_walk, REFERENCE_DRIFT.source: ((self._drifted.mT @ moved) ** 2).sum(axis=(0, 1)),
         }  # fmt: skip
+        if self._beside.size:
+            shares[BESIDE] = ((self._beside.mT @ moved) ** 2).sum(axis=(0, 1))
         by_degrees = ((self._degrees.mT @ moved) ** 2).sum(axis=(0, 1))
         return shares | ({TEMPERATURE: by_degrees} if self._degrees.size else {})
+
+
+def _beside_one_axis(windows: Windows, s: Statements, u: Array) -> Array:
+    """(W, 6M, n) what the slopes of windows scatter by motion across that of a uniaxial reference, over it `u` (W,).
+
+    At a fixed mount it is the structure that moves, by wind and traffic: another way in each window, in phase with what
+    the reference measures and 90 deg ahead. n is 0 for a mount that turns: what moves it there is one thing, and so is
+    its motion across (calib.estimate.terms). S across the motion is as nobody knows it.
+    """
+    own, w, m = windows.stack, len(u), windows.channels
+    if windows.away is None or own_channels(m) != 1:
+        return np.zeros((w, 6 * m, 0))
+    in_phase = np.concatenate([own.along[:, 0], own.along_rate_s[:, 0]], axis=1)
+    ahead = np.eye(1, 2 * m, m) * windows.per_omega[:, None]
+    across = np.linalg.svd(own.direction[:, :, :1])[0][:, :, 1:]
+    unknown = np.minimum(s.u[:9], FLAT * s.scale).reshape(3, 3)
+    alike = s.nominal @ across
+    each = np.sqrt(unknown**2 @ across**2)[:, :, None] * np.eye(3)[:, :, None]
+    by_output = np.concatenate([alike, each.reshape(w, 3, 6)], axis=2) / own.noise[..., None]
+    found = []
+    for motion in (in_phase, ahead):
+        moved = (own.root @ motion[..., None]) * u[:, None, None]
+        found.append((moved[:, :, None] * by_output[:, None]).reshape(w, 6 * m, 8))
+    return np.concatenate(found, axis=2)
 
 
 def _by_channel(windows: Windows) -> Array:

@@ -79,11 +79,11 @@ def banded(
 
 
 class Factors:
-    """The regressions of V on u and du/dt in B bands of a window.
+    """The regressions of V on u and du/dt in B bands of a window; V has A outputs, three or that along the motion.
 
-    `gram` (B, 2M, 2M) is that of [u, du/dt], `root` (B, 2M, 2M) its factor, `slopes` (B, 2M, 3) = root b, `noise`
-    (B, 3) their noise. `omega` (B,) in rad/s is that of the motion in the band, `middle_hz` (B,) the band's middle.
-    `told` and `left` (B, 3): the power of V that the motion explains, and the rest; `white` (B, 3): what white noise of
+    `gram` (B, 2M, 2M) is that of [u, du/dt], `root` (B, 2M, 2M) its factor, `slopes` (B, 2M, A) = root b, `noise`
+    (B, A) their noise. `omega` (B,) in rad/s is that of the motion in the band, `middle_hz` (B,) the band's middle.
+    `told` and `left` (B, A): the power of V that the motion explains, and the rest; `white` (B, A): what white noise of
     sensor and reference has in it. Of the `points` (B,), the rest has `free` (B,) degrees of freedom.
     """
 
@@ -113,16 +113,16 @@ class Factors:
         self.noise = np.maximum(np.sqrt(left / freedom[:, None] / bands.independent), TINY)
 
     def seen(self, response: Complex) -> Array:
-        """(..., 3, 2 M B, M) whitened slopes of each axis, by channel, if V is `response` (..., B) times u."""
+        """(..., A, 2 M B, M) whitened slopes of each axis, by channel, if V is `response` (..., B) times u."""
         m = self.root.shape[2] // 2
         rows = response.real[..., None, None] * self.root[..., :m]
         rows += (response.imag / self.omega)[..., None, None] * self.root[..., m:]
         rows = rows[..., None, :, :, :] / self.noise.T[:, :, None, None]
-        return np.asarray(rows.reshape(*response.shape[:-1], 3, -1, m))
+        return np.asarray(rows.reshape(*response.shape[:-1], self.noise.shape[1], -1, m))
 
     def observed(self) -> Array:
-        """(3, 2 M B) whitened slopes of each axis."""
-        return np.asarray((self.slopes / self.noise[:, None, :]).transpose(2, 0, 1).reshape(3, -1))
+        """(A, 2 M B) whitened slopes of each axis."""
+        return np.asarray((self.slopes / self.noise[:, None, :]).transpose(2, 0, 1).reshape(self.noise.shape[1], -1))
 
     def by_row(self, values: Array) -> Array:
         """Values of the bands (..., B) for each of the rows (..., 2 M B)."""
@@ -202,7 +202,7 @@ def _told(factors: Factors, powers: int) -> _WindowBands:
     observed = factors.observed()
     live = own.any(axis=(0, 1))
     moving = own[..., live]
-    gain = np.zeros((3, own.shape[2], 1))
+    gain = np.zeros((len(observed), own.shape[2], 1))
     gain[:, live] = _fitted(moving, observed)
     # With the lag in the fit, a lag that is left does not reduce the gain.
     gain[:, live] = _fitted(np.concatenate([moving, lagged @ gain], axis=2), observed)[:, :-1]
@@ -210,18 +210,20 @@ def _told(factors: Factors, powers: int) -> _WindowBands:
     ways, _ = np.linalg.qr(free)
     rows = np.concatenate([observed[..., None], *(factors.seen(terms.T) @ gain)], axis=2)
     rows = (rows - ways @ (ways.transpose(0, 2, 1) @ rows)).reshape(-1, 1 + powers)
-    at_hz, noise = np.tile(factors.by_row(factors.middle_hz), 3), factors.by_row(factors.noise.T).ravel()
+    at_hz, noise = np.tile(factors.by_row(factors.middle_hz), len(observed)), factors.by_row(factors.noise.T).ravel()
     signal = np.where(observed.ravel() != 0.0, observed.ravel() - rows[:, 0], 0.0)
-    weighted = (signal * noise**2).reshape(3, -1, 1)
+    weighted = (signal * noise**2).reshape(len(observed), -1, 1)
     moved = float(np.sum((weighted - ways @ (ways.transpose(0, 2, 1) @ weighted)) ** 2))
-    return _WindowBands(rows[:, 0], rows[:, 1:], signal, at_hz, noise, 3 * free.shape[2], moved)
+    return _WindowBands(rows[:, 0], rows[:, 1:], signal, at_hz, noise, len(observed) * free.shape[2], moved)
 
 
 def _left_open(factors: Factors, powers: int) -> LeftOpen:
     rest = factors.left * (factors.points / factors.free)[:, None]
     white = np.where(np.isfinite(factors.white), factors.white, rest)
     chance = 2.0 * rest**2 / factors.free[:, None] + (U_WHITE * white) ** 2
-    rows, third = np.hstack([factors.told, rest - white, chance]), _third(factors.middle_hz)
+    silent = np.zeros((len(rest), 3 - rest.shape[1]))
+    rows = np.hstack([part for own in (factors.told, rest - white, chance) for part in (own, silent)])
+    third = _third(factors.middle_hz)
     thirds = [(k, tuple(rows[third == k].sum(axis=0).tolist())) for k in distinct(third).tolist()]
     moments = factors.told.sum(axis=1) @ by_term(factors.omega, powers).real
     return LeftOpen(tuple(thirds), tuple(moments.tolist()))

@@ -35,6 +35,7 @@ HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is 
 LEAKED = 1.0  # of the power of a band, that may be of motion at other frequencies: with more, it shows their response
 NEAR_LINES = 3  # around a line that it has itself: the main lobe of a taper
 LEAST_LEAK = 1e-12  # of a line's power, in another one: what is less is beyond the numbers
+ALIKE = 0.8  # least cosine of the angle between the slopes of V and the motion, as if the outputs were the axes
 LASTS = 0.25  # of its mean power that a band has for half of the time: with less, its motion comes and goes
 BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
 
@@ -113,6 +114,23 @@ def beside_noise(bands: BandSums, sensor_noise: Array) -> BandSums:
     noise = bands.noise.copy()
     noise[:, -3:] = bands.points[:, None] * sensor_noise**2
     return replace(bands, noise=noise)
+
+
+def along_motion(bands: BandSums, direction: Array) -> BandSums:
+    """The bands of a uniaxial reference with one output in the place of three: V along the motion, `direction` (3,).
+
+    Motion across, which such a reference does not measure, is another one in each band: the sensor's outputs across
+    show it as if they had another response over frequency there. Where no axis of the sensor is the output that it
+    is taken for, V is taken along the slopes.
+    """
+    u, m = bands.products[:, 0, 0].sum(), bands.reference_channels
+    slopes = bands.products[:, 0, 2 * m :].sum(axis=0) / max(float(u), np.finfo(float).tiny)
+    length = max(float(np.linalg.norm(slopes)), np.finfo(float).tiny)
+    way = direction if abs(slopes @ direction) > ALIKE * length else slopes / length
+    to = np.zeros((2 * m + 1, 2 * m + 3))
+    to[: 2 * m, : 2 * m], to[2 * m, 2 * m :] = np.eye(2 * m), way
+    products = to @ bands.products @ to.T
+    return replace(bands, products=products, noise=bands.noise @ (to**2).T)
 
 
 def without_integrals(bands: BandSums) -> BandSums:

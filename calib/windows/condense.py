@@ -13,9 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from calib.model import Array, BandSums, WindowSums, own_channels
+from calib.model import Array, BandSums, Pose, WindowSums, own_channels
 from calib.signal.response import POWERS
 from calib.windows.banded import Banded, banded
+from calib.windows.bands import along_motion
 from calib.windows.excited import NOISE_LEFT, OF_STRONGEST
 from calib.windows.type_a import LEAST_INFLATION, Index, Segments, TypeA, in_order, pooled
 
@@ -31,6 +32,9 @@ ROUNDING = 1e-12  # of a channel's mean: in a window in which it is constant, di
 
 class WindowToCondense(Protocol):
     """What is condensed: a calib.model.Window, or what calib.windows.excited leaves of it."""
+
+    @property
+    def pose(self) -> Pose: ...
 
     @property
     def sums(self) -> WindowSums: ...
@@ -90,7 +94,7 @@ def condense(
     omega2, of_each = (in_order(parts, own) for own in zip(*(_omega2(p, channels) for p in powers_of), strict=True))
     told = None
     if response_hz:
-        bands = (w.bands for w in windows)
+        bands = (_along(w) for w in windows)
         told = banded(bands, channels, response_hz, omega2, of_each, one_frequency=one_frequency, powers=powers)
     return Condensed(
         channels=channels,
@@ -103,6 +107,14 @@ def condense(
         type_a=pooled(parts, roots, whiteners, alike=alike),
         bands=told,
     )
+
+
+def _along(window: WindowToCondense) -> BandSums | None:
+    """The bands that tell the response: of V along the motion, where the reference measures no other one."""
+    bands = window.bands
+    if bands is None or own_channels(bands.reference_channels) != 1:
+        return bands
+    return along_motion(bands, window.pose.direction[:, 0])
 
 
 def regressed(root: Array, slopes: Array) -> Array:
