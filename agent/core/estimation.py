@@ -13,7 +13,7 @@ import numpy as np
 from agent.config import Channel
 from agent.config.knowledge import Prior
 from agent.core.exchanges import Explained, exchanged, explanation
-from agent.core.explaining import explained, most_likely
+from agent.core.explaining import explained, motion_across, most_likely
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
 from agent.core.hypotheses import Devices, confirmed, possible_jump, rescaled, shape_of_change, tilt_rad
 from agent.core.noise_watch import NoiseWatch
@@ -261,6 +261,8 @@ class Estimation:
         adopted, who = confirmed(self.state, held, self._devices, limit)
         if self._exchanged or (found := exchanged(self.state, held, limit)) is None:
             return Jump(adopted, who)
+        if motion_across(self.state, held):
+            return Jump(adopted, who)
         if found.scale is not None:
             adopted = rescaled(self.state, held, found.scale, limit) or adopted
         return Jump(adopted, who, at_once=True)
@@ -326,6 +328,8 @@ class Estimation:
         self._explain_s = now_s + self._channel.gate.explain_after_s
         if self.lag_watch.beyond:
             return f"the held windows show another lag: {self.lag_watch.beyond}"
+        if across := motion_across(self.state, self._held):
+            return across
         if (found := exchanged(self.state, self._held, self.gate.limit)) is not None:
             return self._exchange(found, utc_ns * 1e-9 - now_s)
         jump, number = possible_jump(self.state, self._held), self._acceptable()

@@ -20,7 +20,7 @@ from calib.estimate.innovation import Innovation
 from calib.estimate.nuisances import RESPONSE_U
 from calib.estimate.quantities import ALL_RATES, OFFSET, RESPONSE, Kind, Quantity
 from calib.geometry import STANDARD_GRAVITY_MPS2
-from calib.model import PARAMETERS, Array
+from calib.model import PARAMETERS, Array, own_channels
 from calib.state.state import State
 from calib.windows.record import Record
 
@@ -32,6 +32,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "s": ("ms", 1e3),
     "1/K": ("%/K", 100.0),
 }
+ACROSS, MORE = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0), 2.0  # of the motion, as it is tried; times what is stated, at least
 WORTH = 3.0  # an explanation that makes what chi-squared has beyond chance smaller by less explains nothing
 
 COMPARE = "Compare devices and mount with the configuration"
@@ -93,6 +94,28 @@ def explained(
         f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}.{as_well} "
         f"{_remedy(best, state.scale, channel, number) if helps else best.unfit or COMPARE}"
     )
+
+
+def motion_across(state: State, held: Sequence[Record]) -> str:
+    """Whether motion across a uniaxial reference explains held windows at a fixed mount, for an operator; else "".
+
+    The sensor feels this motion, and shows it along its other axes. Where more of it moves than is stated, each window
+    asks for another change of S.
+    """
+    own, statements = held[-1], state.statements
+    if statements.held_mps2 is None or own_channels(own.channels) != 1:
+        return ""
+    stated = statements.of(own.reference).transverse
+    for u in (u for u in ACROSS if u >= MORE * stated):
+        trial = state.stating(transverse=u)
+        told = [trial.innovation(record) for record in held]
+        if sum(one.statistic for one in told) <= sum(one.degrees_of_freedom for one in told):
+            return (
+                f"{len(held)} held windows agree with the state if the structure also moves across the reference, by "
+                f"some {100.0 * u:.2g} % of what the reference measures; {100.0 * stated:.2g} % is stated. If it does, "
+                f"set uncertainty.transverse_motion_pct to {100.0 * u:.2g}; the S that the reference tells is sound"
+            )
+    return ""
 
 
 def _alike(tried: Sequence[Explanation], before: float, by_chance: int) -> list[Explanation]:

@@ -328,8 +328,8 @@ class Month:
     worst element in force was beyond 3 u and 4 u while VALID; `unseen`: how many of the latter were between an event
     and the window that told it. `u_pct` of the main sensitivities before the first event and in the end, relative.
 
-    Of each event that was `told` by name: after how many windows, the largest error of the change of S after twelve
-    more windows, over u of S in force then, and what was said.
+    Of each event that was `told` by name: after how many windows, the error of the change of S after twelve more
+    windows (see `error_of_change`), and what was said.
     """
 
     job: Job
@@ -379,14 +379,20 @@ def month(job: Job, hours: Sequence[Hour]) -> Month:
         k, text = next(found, (first + HOURS_A_DAY, ""))
         unseen += sum(hour.status == "VALID" and hour.worst > 4.0 for hour in hours[first:k])
         if text:
-            later = hours[k + SETTLED]
-            error = (later.value - before.value) - (later.truth - before.truth)
-            told[event] = k - first + 1, float(np.max(np.abs(error / later.u)[:9])), text
+            told[event] = k - first + 1, error_of_change(before, hours[k + SETTLED]), text
     beyond = [sum(hour.worst > most and hour.status == "VALID" for hour in hours) for most in (3.0, 4.0)]
     share = {name: sum(hour.status == name for hour in hours) / len(hours) for name in ("VALID", "HELD")}
     ends = [hours[k].u[MAIN] / np.abs(hours[k].value[MAIN]) for k in (at_visit("shock") - 1, -1)]
     u_pct = 100.0 * float(ends[0].max()), 100.0 * float(ends[1].max())
     return Month(job, share["VALID"], share["HELD"], (beyond[0], beyond[1]), unseen, u_pct, told)
+
+
+def error_of_change(before: Hour, later: Hour) -> float:
+    """The largest error of the change of a determined S, over u of the change: that of the later S, or of what it was
+    told since then, where that is more. (After a step of the sensor or of its one reference u of S covers both.)"""
+    error = (later.value - before.value) - (later.truth - before.truth)
+    u = np.sqrt(np.maximum(later.u**2, before.u**2 - later.u**2))
+    return float(np.max(np.abs(error / u)[:9], where=(before.determined & later.determined)[:9], initial=0.0))
 
 
 def at_visit(event: str) -> int:

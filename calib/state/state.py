@@ -521,6 +521,13 @@ class State:
         trial.take_also(records, [Step(float(np.nextafter(records[0].day, -np.inf)), dict(u))])
         return trial
 
+    def stating(self, **stated: float) -> Self:
+        """A copy beside whose references other priors are stated, by the names of calib.estimate.nuisances.Priors."""
+        other = self.copy()
+        other._priors = [priors.with_values(stated) for priors in self._priors]
+        other.solve()
+        return other
+
     def change_on(self, day: float, u: Jump) -> tuple[Array, Array]:
         """By how much S and Q changed (12,), and the covariance (12, 12), if unknowns stepped just before the windows
         of a day (see `changes`), and not since then. No change where no window is older."""
