@@ -102,7 +102,10 @@ class Bridge(Building):
         blocks = super().visit(visit)
         if not self._vertical:
             return blocks
-        return [replace(b, indications=np.ascontiguousarray(b.indications[:, 2:])) if b.device == "reference" else b for b in blocks]
+        return [
+            replace(b, indications=np.ascontiguousarray(b.indications[:, 2:])) if b.device == "reference" else b
+            for b in blocks
+        ]
 
     def truth(self, time_s: float) -> BuildingTruth:
         told, mean = super().truth(time_s), self.parameters.weather.mean_degc

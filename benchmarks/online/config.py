@@ -19,7 +19,11 @@ def building_config(building: Building, **keys: Any) -> Config:
     """
     p = building.parameters
     devices = [
-        {"name": name, "driver": "serial-csv", "options": {"port": name, "rate_hz": info.nominal_rate_hz, "axes": info.axes}}
+        {
+            "name": name,
+            "driver": "serial-csv",
+            "options": {"port": name, "rate_hz": info.nominal_rate_hz, "axes": info.axes},
+        }
         for name, info in building.infos().items()
     ]
     channel: dict[str, Any] = {

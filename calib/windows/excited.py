@@ -29,6 +29,7 @@ OF_STRONGEST = 1e-4  # least power relative to that of the strongest channel: 1 
 WEAK = 1e-2  # of a channel with less of the strongest channel's power, what is 90 deg ahead of that one is shared too
 ROUNDING = 1e-12  # of a channel's power, what is left may be a rounding error
 MOST_NOISE = 0.5  # largest part of a segment's power that the correction may subtract
+SAME_RAD = 1e-3  # stated directions that differ by less are one
 AXES = "xyz"
 CORRECTION_SHARE = 0.1  # relative standard uncertainty of the noise's power, from a spectrum of some hundred lines
 NOISE_LEFT = 3.0 * CORRECTION_SHARE  # of the noise's power, what the correction may leave: three of these
@@ -110,16 +111,25 @@ def excited_together(windows: Sequence[Window]) -> tuple[list[Excitation], Array
     """Each window as `excited` leaves it, and the directions (3, k) that they excite together, orthonormal, in the
     sensor's frame. Where k is below 3, no window has motion in other directions: what shows there is noise.
 
-    k is 3 where a window excites all directions, and where the reference has one channel: its pose states directions.
+    k is 3 where a window excites all directions. Beside a uniaxial reference they are the stated directions of motion.
     """
     found = [excited(w) for w in windows]
     moved = [e for e in found if e.live.any()]
+    if moved and all(len(e.live) == 1 for e in moved):
+        return found, _spanned(np.hstack([e.pose.direction[:, :1] for e in moved]))
     if not moved or any(len(e.live) != len(AXES) or e.live.all() or not e.noise.any() for e in moved):
         return found, np.eye(len(AXES))
     ways = excited_ways([motion_of(e.window) for e in moved])
     if ways.shape[1] == len(AXES):
         return found, np.eye(len(AXES))
     return [_within(e, ways) if e.live.any() else e for e in found], ways
+
+
+def _spanned(directions: Array) -> Array:
+    """(3, k) an orthonormal basis of what unit vectors (3, n) span; those within SAME_RAD are one."""
+    ways, size, _ = np.linalg.svd(directions)
+    told = np.count_nonzero(size > SAME_RAD * size[0])
+    return np.eye(len(AXES)) if told == len(AXES) else ways[:, :told]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

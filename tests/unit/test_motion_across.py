@@ -1,0 +1,111 @@
+"""A structure that also moves across a uniaxial reference, another way in each window and at each frequency."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.online import bridge
+from benchmarks.online.life import MAIN, House
+from calib.model import Array, BandSums, Pose
+from calib.signal.response import POWERS
+from calib.windows.banded import Banded, banded
+from calib.windows.bands import along_motion, band_sums
+from calib.windows.condense import condense
+from tests.clamp_windows import S_TRUE, window_of
+
+RATE_HZ, SECONDS = 100.0, 120
+DIRECTION = np.array([0.6, 0.0, 0.8])
+HOURS = 8
+
+
+def moved(seed: int, across: float, noise: float, S: Array = S_TRUE) -> tuple[Array, Array, Array]:
+    """u (n, 1), du (n, 1) and V (n, 3): motion to 20 Hz, and across it another one, of which a part follows u in a way
+    that changes from octave to octave."""
+    random, n = np.random.default_rng(seed), round(RATE_HZ * SECONDS)
+    hz = np.fft.rfftfreq(n, 1.0 / RATE_HZ)
+    within = (hz > 0.5) & (hz < 20.0)
+    lines = np.fft.rfft(random.standard_normal((n, 3)), axis=0) * within[:, None]
+    follows = random.standard_normal((8, 2))[np.clip(np.log2(np.maximum(hz, 0.5)) + 1.0, 0, 7).astype(int)]
+    lines[:, 1:] = across * (follows * lines[:, :1] + lines[:, 1:])
+    own, one, other = np.fft.irfft(lines, n, axis=0).T
+    du = np.fft.irfft(2j * np.pi * hz * lines[:, 0], n)
+    ways = np.array([[-0.8, 0.0, 0.6], [0.0, 1.0, 0.0]])
+    a = np.outer(own, DIRECTION) + np.outer(one, ways[0]) + np.outer(other, ways[1])
+    return own[:, None], du[:, None], a @ S.T + noise * random.standard_normal((n, 3))
+
+
+def told(bands: BandSums) -> Banded:
+    omega2 = np.array([(2.0 * np.pi * 12.0) ** 2])
+    return banded([bands], 1, 20.0, omega2, omega2[:, None], powers=len(POWERS))
+
+
+def test_motion_across_is_no_response_over_frequency() -> None:
+    """With three outputs the bands deviate by tens of per cent from one response; along the motion by what S, which is
+    not the identity, mixes into it."""
+    for seed in range(6):
+        bands = band_sums(*moved(seed, 0.4, 1e-3), RATE_HZ)
+        assert bands is not None
+        assert told(bands).between.relative_u > 0.1, seed
+        one = told(along_motion(bands, DIRECTION)).between
+        assert one.relative_u < 0.03, seed
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["as it stands", "outputs exchanged"])
+def test_response_is_told_as_well_by_the_output_along_the_motion(turned: bool) -> None:
+    """Without motion across, the response is told to the same from one output as from three, also where the outputs are
+    other ones than the axes. 20 windows each, U of what they tell within 3 %."""
+    S = S_TRUE[[2, 0, 1]] if turned else S_TRUE
+    for seed in range(20):
+        bands = band_sums(*moved(seed, 0.0, 0.02, S), RATE_HZ)
+        assert bands is not None
+        three, one = told(bands), told(along_motion(bands, DIRECTION))
+        sizes = [np.sqrt(np.sum(found.moves**2, axis=0)) for found in (three, one)]
+        assert sizes[1] == pytest.approx(sizes[0], rel=0.1), seed
+        assert one.between.relative_u == 0.0, seed
+
+
+def test_a_windows_bands_are_those_along_its_motion() -> None:
+    """The condensed windows of a uniaxial reference use them."""
+    u, du, V = moved(1, 0.4, 1e-3)
+    bands = band_sums(u, du, V, RATE_HZ)
+    pose = Pose("along", DIRECTION[:, None], np.full(3, np.nan))
+    window = replace(window_of(pose, u, du, V, 12), bands=bands)
+    data = condense([window], response_hz=20.0)
+    assert data.bands is not None
+    assert data.bands.between.relative_u < 0.03
+
+
+def hours(transverse_pct: float) -> House:
+    """The bridge beside a vertical reference for some windows, an hour apart."""
+    made = bridge.world(bridge.SEED + 1, "vertical", bridge.SENSORS[0], transverse_pct)
+    channel = made.config.channels[0]
+    gate = channel.gate.model_copy(update={"explain_after_s": 3600.0})
+    config = made.config.model_copy(update={"channels": (channel.model_copy(update={"gate": gate}),)})
+    house = House(made.bridge, config)
+    for _ in range(HOURS):
+        house.visit()
+    return house
+
+
+def test_a_bridge_beside_a_vertical_reference_is_calm_where_its_motion_across_is_stated() -> None:
+    gateway = hours(50.0).gateway
+    update = gateway.in_force
+    assert update is not None
+    assert gateway.status == "VALID"
+    judged = [report for report in gateway.reports if "innovation_chi2" in report.numbers]
+    assert len(judged) >= HOURS
+    assert all(report.used for report in judged)
+    truth = gateway.truth.copy()
+    u = np.array(update.standard_uncertainty)
+    assert list(np.array(update.determined)[MAIN]) == [False, False, True]
+    assert abs(np.ravel(update.sensitivity)[8] - truth[8]) < 3.0 * u[8]
+    assert u[8] < 0.003
+
+
+def test_motion_across_that_is_not_stated_is_named_and_not_an_inverted_output() -> None:
+    reasons = hours(1.0).gateway.reasons
+    assert any("moves across the reference" in reason and "transverse_motion_pct to" in reason for reason in reasons)
+    assert not any("inverted" in reason for reason in reasons)
