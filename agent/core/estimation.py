@@ -13,7 +13,7 @@ import numpy as np
 from agent.config import Channel
 from agent.config.knowledge import Prior
 from agent.core.exchanges import Explained, exchanged, explanation
-from agent.core.explaining import explained, motion_across, most_likely
+from agent.core.explaining import explained, most_likely, motion_across
 from agent.core.gate import PROPOSALS_KEPT, Decision, Evidence, Gate, fields_of
 from agent.core.hypotheses import Devices, confirmed, possible_jump, rescaled, shape_of_change, tilt_rad
 from agent.core.noise_watch import NoiseWatch

@@ -24,7 +24,7 @@ from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import KnownResponses, ResponseTold, response_told, told_at_one_frequency
-from calib.model import Array, Calibration, Window
+from calib.model import Array, Calibration, Window, own_channels
 from calib.windows.bands import motion_band_hz
 from calib.windows.condense import Condensed, condense, effective
 from calib.windows.excited import excited_together
@@ -32,6 +32,9 @@ from calib.windows.never_turned import mean_input, never_turned
 
 SCATTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
 SCATTER_SETTLED = 0.05
+# Noise of an axis over that of another one, as variances: of MEMS 6 at most (2.5 times the rms). Times what is stated,
+# from which the motion across a uniaxial reference that the data show counts.
+NOISIER_AXIS, MORE_ACROSS = 10.0, 2.0
 # Standard uncertainty, over the sensor's scale, of S along a direction that nothing excited, where it becomes a prior.
 # An element of which more than UNSEEN_SHARE (calib.adjustment.equations) lies along it may then be off by that scale.
 UNKNOWN = 50.0
@@ -88,6 +91,8 @@ class Adjustment:
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
     standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
     blanked. `response`: over frequency; None where it is no unknown. `share`: what S and Q owe to the reference.
+    `motion_across`: u of the motion across a uniaxial reference, relative, where the data show much more of it than is
+    stated, and it took the place of that; else 0.
     """
 
     calibration: Calibration
@@ -108,6 +113,7 @@ class Adjustment:
     covariance: Array
     response: ResponseTold | None
     share: ReferenceShare | None
+    motion_across: float
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -170,6 +176,11 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     model = priors.response_model
     to_hz, one = np.inf if model.one_frequency else model.to_hz, model.one_frequency
     data = condense(found, alike=plain, response_hz=to_hz, one_frequency=one, powers=model.powers)
+    across = 0.0 if plain else _motion_across(data)
+    if across <= MORE_ACROSS * priors.transverse:
+        across = 0.0
+    else:
+        priors = priors.with_values({"transverse": across})
     if not plain:
         data = effective(data, np.array([w.independent for w in used]))
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
@@ -212,7 +223,21 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         covariance=shares.covariance,
         response=_response(solution, shares.covariance, priors, used, k),
         share=share_after(solution),
+        motion_across=across,
     )
+
+
+def _motion_across(data: Condensed) -> float:
+    """The rms of motion across a uniaxial reference that the sensor shows along an axis, over that of the motion; 0
+    where what the motion leaves of the outputs is much alike, as noise is. The part of it that follows the motion looks
+    like S, and is about as large."""
+    if own_channels(data.channels) != 1:
+        return 0.0
+    rest = data.type_a.noise**2
+    power = data.slopes[:, 0] ** 2 @ np.ones(3) / data.count
+    beyond = np.where(rest.max(axis=1) > NOISIER_AXIS * rest.min(axis=1), np.ptp(rest, axis=1), 0.0)
+    total = float(data.count @ power)
+    return float(np.sqrt(data.count @ beyond / total)) if total > 0.0 else 0.0
 
 
 def _response(

@@ -35,8 +35,8 @@ def motion_numbers(
 
 def _in_band(basis: Array, V: Array, rate_hz: float, noise: Array) -> tuple[dict[str, float], float]:
     """Level of the reference, its `noise` (m,) and the coherence, after averages that leave most of the motion; and the
-    largest sensitivity of V to it, in output unit per m/s2. Beside a uniaxial reference the coherence is that of V along
-    the slopes."""
+    largest sensitivity of V to it, in output unit per m/s2. Beside a uniaxial reference the coherence is that of V
+    along the slopes."""
     m = len(noise)
     u = basis[:, 1 : 1 + m]
     width = detection.band_width(u, rate_hz, noise)

@@ -86,12 +86,23 @@ def adjusted(
     outcome, found = _at_rest(told, priors)
     outcome = _with_remedy(outcome, tables, priors)
     outcome = replace(outcome, more={**outcome.more, "band_hz": band_hz})
+    if found is not None and found.motion_across:
+        outcome = replace(outcome, warnings=(_across(found.motion_across, priors.transverse),))
     if found is None or (share := found.share) is None:
         return outcome
     if certificate is not None:
         share = replace(share, sensitivity=certificate.sensitivity)
     identity = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
     return replace(outcome, more={**outcome.more, "shared_errors": [share.told(*identity)]})
+
+
+def _across(seen: float, stated: float) -> str:
+    return (
+        f"the sensor shows motion across the uniaxial reference, some {100.0 * seen:.2g} % of what it measures, or "
+        f"one axis has much more noise than another; u_transverse_motion_pct is {100.0 * stated:.2g}, and "
+        f"{100.0 * seen:.2g} counts: S across the motion is uncertain by as much. Move it along one line, or use a "
+        "tri-axial reference"
+    )
 
 
 def _in_the_widest(tables: Tables, priors: Priors) -> tuple[_AdjustedOutcome, Band | None]:

@@ -41,7 +41,7 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
     if outcome.reasons or (silent and feels):  # what a dead channel does not feel of gravity would be taken for Q
         found = causes(sensor, reference, poses, outcome)
         return replace(outcome, calibration=None, reasons=(*found, *silent, *outcome.reasons))
-    told = [*axis_warnings(outcome.sensitivity), *silent]
+    told = [*outcome.warnings, *axis_warnings(outcome.sensitivity), *silent]
     if reference is not None and _setting(options, reference).reference_coupling == "dc":
         told += gravity_warnings(reference)
     return replace(outcome, warnings=tuple(told))

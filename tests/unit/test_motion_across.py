@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.online import bridge
 from benchmarks.online.life import MAIN, House
+from calib import calibrate
 from calib.model import Array, BandSums, Pose
 from calib.signal.response import POWERS
 from calib.windows.banded import Banded, banded
@@ -21,7 +22,9 @@ DIRECTION = np.array([0.6, 0.0, 0.8])
 HOURS = 8
 
 
-def moved(seed: int, across: float, noise: float, S: Array = S_TRUE) -> tuple[Array, Array, Array]:
+def moved(
+    seed: int, across: float, noise: float, S: Array = S_TRUE, way: Array = DIRECTION
+) -> tuple[Array, Array, Array]:
     """u (n, 1), du (n, 1) and V (n, 3): motion to 20 Hz, and across it another one, of which a part follows u in a way
     that changes from octave to octave."""
     random, n = np.random.default_rng(seed), round(RATE_HZ * SECONDS)
@@ -32,8 +35,8 @@ def moved(seed: int, across: float, noise: float, S: Array = S_TRUE) -> tuple[Ar
     lines[:, 1:] = across * (follows * lines[:, :1] + lines[:, 1:])
     own, one, other = np.fft.irfft(lines, n, axis=0).T
     du = np.fft.irfft(2j * np.pi * hz * lines[:, 0], n)
-    ways = np.array([[-0.8, 0.0, 0.6], [0.0, 1.0, 0.0]])
-    a = np.outer(own, DIRECTION) + np.outer(one, ways[0]) + np.outer(other, ways[1])
+    ways = np.linalg.svd(way[None])[2][1:]
+    a = np.outer(own, way) + np.outer(one, ways[0]) + np.outer(other, ways[1])
     return own[:, None], du[:, None], a @ S.T + noise * random.standard_normal((n, 3))
 
 
@@ -76,6 +79,24 @@ def test_a_windows_bands_are_those_along_its_motion() -> None:
     data = condense([window], response_hz=20.0)
     assert data.bands is not None
     assert data.bands.between.relative_u < 0.03
+
+
+@pytest.mark.parametrize("across", [0.0, 0.3])
+def test_calibrate_counts_the_motion_across_that_the_sensor_shows(across: float) -> None:
+    """With the default of 1 %: S of a sensor along z, of which the outputs x and y show motion across. What it tells of
+    S is right, and there is a warning; none where nothing moves across. 6 recordings."""
+    for seed in range(6):
+        S = np.eye(3) + 0.01 * np.random.default_rng([seed, 1]).standard_normal((3, 3))
+        u, _, V = moved(seed, across, 0.01, S, np.array([0.0, 0.0, 1.0]))
+        time_s = np.arange(len(u)) / RATE_HZ
+        poses = [{"start_s": 1.0, "stop_s": SECONDS - 1.0, "dx": 0.0, "dy": 0.0, "dz": 1.0}]
+        told = calibrate((time_s, V), {"time_s": time_s, "a": u[:, 0]}, poses=poses, reference_coupling="dc")
+        known = np.array(told.determined)[:9]
+        error = (np.array(told.sensitivity) - S).ravel()[known] / np.array(told.standard_uncertainty)[:9][known]
+        assert told.status == "valid", told.reasons
+        assert known[8]
+        assert np.abs(error).max() < 3.5, seed
+        assert any("across" in warning for warning in told.warnings) == (across > 0.0), seed
 
 
 def hours(transverse_pct: float) -> House:
