@@ -500,8 +500,8 @@ class State:
 
         `u_rate` (12,): S and Q may drift by as much more a day. Of the reference at a place tell `line`: a device or
         its line may have begun anew, which makes the lag another; and `another_filter`: the response over frequency may
-        be another, so that S, which holds at one frequency, changes by about this share of itself; inf if nobody knows by
-        how much.
+        be another, so that S, which holds at one frequency, changes by about this share of itself; inf if nobody knows
+        by how much.
         """
         u = {q.key: abs(float(s)) for q, s in zip(self.quantities, standard_uncertainty, strict=False) if s}
         u |= {ALL_RATES[p]: abs(float(u_rate[p])) for p in np.flatnonzero(u_rate).tolist()}
