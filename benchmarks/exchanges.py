@@ -84,7 +84,7 @@ def settled(random: np.random.Generator, S: Array = S_TRUE, windows: int = BEFOR
 
 def record_of(found: Estimation, random: np.random.Generator, cause: Exchange, hour: int, S: Array = S_TRUE) -> Record:
     """The record of a window after this change."""
-    at = found.lag_s, 20.0, found.state.reference, found.state.motion_to_hz
+    at = found.state.lag_s(), 20.0, found.state.reference(), found.state.motion_to_hz
     return Record.of(changed(random, cause, S), hour / 24, *at)
 
 

@@ -57,8 +57,7 @@ def verdict(kind: str, size: float, seed: int) -> str:
     errors = {name: 1.0 + 1e-3 * random.standard_normal(3) for name in "AB"}
     S = np.eye(3) + 0.01 * random.standard_normal((3, 3))
     for place, name in enumerate("AB"):
-        state.use(place)
-        state.meet(name)
+        state.meet(name, place=place)
     held: list[Record] = []
     stepped = "A" if kind == "reference in use" else "B"
     for k in range(BEFORE + AFTER):
@@ -70,7 +69,6 @@ def verdict(kind: str, size: float, seed: int) -> str:
         elif k == BEFORE:
             errors[stepped] = errors[stepped] * (1.0 + size)
         window = building_window(random, level_mps2=LEVEL, S=S, reference_error=errors[name] - 1.0)
-        state.use("AB".index(name))
         record = Record.of(window, day, reference=name, to_hz=state.motion_to_hz)
         told = state.innovation(record)
         if told.statistic <= limit(told.degrees_of_freedom) or k < BEFORE:
@@ -79,7 +77,7 @@ def verdict(kind: str, size: float, seed: int) -> str:
         held.append(record)
         if len(held) == HELD:
             other = "B" if name == "A" else "A"
-            adopted, who = confirmed(state, held, Devices(name, other, 5e-3), limit)
+            adopted, who = confirmed(state, held, Devices(name, other, 5e-3, "AB".index(name)), limit)
             if adopted is None or not who or "tells whether" in who:
                 return "undecided"
             named = "sensor" if "the sensor has changed" in who else f"reference {who.split('the reference ')[1][0]}"

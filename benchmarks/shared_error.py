@@ -53,7 +53,7 @@ def covered(references: int) -> tuple[Array, Array]:
         one, other = (child(random, error, S) for S in CHILDREN)
         found = [c.result() for c in (one, other)]
         off = np.diag(found[0].sensitivity - found[1].sensitivity - CHILDREN[0] + CHILDREN[1])
-        both, cross = found[0].covariance + found[1].covariance, shared_covariance(one.shares, other.shares)
+        both, cross = found[0].covariance + found[1].covariance, shared_covariance(one.shares(), other.shares())
         shared += np.abs(off) < 1.96 * np.sqrt(np.diag(both - cross - cross.T)[MAIN])
         alone += np.abs(off) < 1.96 * np.sqrt(np.diag(both)[MAIN])
     return shared, alone

@@ -47,6 +47,7 @@ from agent.core.watched import (
 from agent.core.windows import refused
 from calib.estimate.correction import Law
 from calib.model import Calibration, Pose, Window
+from calib.state.state import FIRST
 from hw.block import SampleBlock
 
 REFUSED_IN_A_ROW = 3
@@ -268,20 +269,18 @@ class ChannelState:
         for piece in self._streams.due(self._time.now_s):
             place = self._streams.place
             if self._estimation is not None:
-                self._estimation.use(place)
-                self._estimation.date_certificate(self._first_day + self._time.now_s / DAY_S, self._time.utc_ns)
+                day = self._first_day + self._time.now_s / DAY_S
+                self._estimation.date_certificate(day, self._time.utc_ns, place)
             try:
                 unusable = self._references.not_certified[place]
                 for verdict in self._streams.verdicts(piece, self._first_day, self._estimation, unusable):
-                    yield from self._results(verdict)
+                    yield from self._results(verdict, place)
             except MemoryError:
                 raise  # not caused by the data: a replay would not repeat it
             except Exception as error:
                 fault = told(error)
                 reason = f"a fault of the program, not of the data; please report it: {fault}"
                 yield from self._refuse(refused(piece, reason), reason, fault)
-            if self._estimation is not None:
-                self._estimation.use(0)
 
     def _refuse(self, window: Window, reason: str, fault: str = "") -> Iterator[Result]:
         """Report a window that is not used. After a fault of the program, and after REFUSED_IN_A_ROW such windows,
@@ -291,7 +290,8 @@ class ChannelState:
         if fault or self._refused == REFUSED_IN_A_ROW:
             yield self._told(f"S and Q are not updated: {reason}")
 
-    def _results(self, verdict: JudgedWindow) -> Iterator[Result]:
+    def _results(self, verdict: JudgedWindow, place: int = FIRST) -> Iterator[Result]:
+        """The results of a window beside the reference at a place."""
         window, judged, source = verdict.window, verdict.judged, self._source()
         if judged is None or self._estimation is None:
             yield from self._refuse(window, window.reason or f"{self.sensor} has not been connected in this run")
@@ -307,22 +307,22 @@ class ChannelState:
         for drift in judged.drift:
             yield drift_report(source, drift, self._channel.drift.false_alarms_a_year, origin_utc_ns)
         if decision.proposal is not None:
-            yield estimate(source, decision.reason, self._update(decision.proposal))
+            yield estimate(source, decision.reason, self._update(decision.proposal, place))
         if decision.in_force:
-            yield self._put_in_force()
+            yield self._put_in_force(place=place)
         yield from self._say_status(decision.reason)
 
-    def _put_in_force(self, earlier: CalibrationUpdate | None = None) -> CalibrationUpdate:
+    def _put_in_force(self, earlier: CalibrationUpdate | None = None, place: int = FIRST) -> CalibrationUpdate:
         """The update that puts the estimation's calibration in force. `earlier` made it, if it was made before."""
         assert self._estimation is not None
-        update = with_budget(self._update(self._estimation.in_force), self._estimation.budget)
+        update = with_budget(self._update(self._estimation.in_force, place), self._estimation.budget)
         self._in_force = update if earlier is None else again(update, earlier)
         return self._in_force
 
-    def _update(self, calibration: Calibration) -> CalibrationUpdate:
+    def _update(self, calibration: Calibration, place: int = FIRST) -> CalibrationUpdate:
         assert self._estimation is not None
-        state, shares = self._estimation.state, self._estimation.shares_of(calibration)
-        return calibration_update(self._source(), calibration, state, shares, self._references.certificate_of)
+        state, shares = self._estimation.state, self._estimation.shares_of(calibration, place)
+        return calibration_update(self._source(), calibration, state, shares, self._references.certificate_of, place)
 
     # --- without a reference
 

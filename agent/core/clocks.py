@@ -64,7 +64,7 @@ class Clocks:
 
 
 def _lag(estimation: Estimation | None) -> tuple[float, float]:
-    if estimation is None or "lag" not in estimation.state.names:
+    if estimation is None or "lag" not in estimation.state.names():
         return UNKNOWN
     return estimation.state.quantity("lag")
 

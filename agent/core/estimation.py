@@ -27,9 +27,8 @@ from calib.estimate.innovation import Innovation
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.statements import Step
 from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums, own_channels
-from calib.signal.response import Response
 from calib.state.sources import Sources
-from calib.state.state import State
+from calib.state.state import FIRST, State
 from calib.state.walks import Walks
 from calib.windows.record import Record
 
@@ -113,7 +112,7 @@ class Estimation:
         Raises ValueError where nothing tells a sensitivity to begin with.
         """
         self._channel = channel
-        self._beside, self._place = channel.by_reference, 0
+        self._beside = channel.by_reference
         mean, fixed = channel.prior.mean(nominal), channel.fixed_mount
         u = channel.prior.standard_uncertainty(mean)
         priors, *check = (beside.priors(fixed_mount=fixed) for beside in self._beside)
@@ -129,116 +128,103 @@ class Estimation:
         self._proposed: list[Proposal] = []
         self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
         self._tried: TrialWindow | None = None  # the newest window, for what is asked of it next
-        self._lag_watches = [LagWatch(beside, self.gate.limit) for beside in self._beside]
+        self._lag_watches = [LagWatch(beside, k, self.gate.limit) for k, beside in enumerate(self._beside)]
         self._exchanged = False  # held windows show exchanged or rescaled outputs, and this was told
         self._explain_s: float | None = None  # time of the next explanation of held windows; None where none are held
 
-    def use(self, place: int) -> None:
-        """The next windows are of the reference at this place: 0 is the first one, 1 the second one."""
-        self._place = place
-        self.state.use(place)
+    def _devices(self, place: int) -> Devices:
+        own = self._beside[place]
+        others = [beside.reference for other, beside in enumerate(self._beside) if other != place]
+        other = (others[0] or "") if others else ""
+        return Devices(own.reference or "", other, own.certificate.stability_pct / 100.0, place)
 
-    @property
-    def _devices(self) -> Devices:
-        own = self._beside[self._place]
-        others = [beside.reference for place, beside in enumerate(self._beside) if place != self._place]
-        return Devices(own.reference or "", (others[0] or "") if others else "", own.certificate.stability_pct / 100.0)
-
-    @property
-    def lag_watch(self) -> LagWatch:
-        """The watch of the lag behind the reference in use."""
-        return self._lag_watches[self._place]
+    def lag_watch(self, place: int) -> LagWatch:
+        """The watch of the lag behind the reference at a place."""
+        return self._lag_watches[place]
 
     def began(self, device: str) -> None:
         """A device or its line began anew: it may be late by another time from now on."""
-        present = self._place
-        for place, beside in enumerate(self._beside):
+        for beside, watch in zip(self._beside, self._lag_watches, strict=True):
             if device in (beside.sensor, beside.reference):
-                self.use(place)
-                self.lag_watch.began(self.state, device)
-        self.use(present)
+                watch.began(self.state, device)
 
-    @property
-    def lag_s(self) -> float:
-        """By which the sensor's indications come after the reference's, as far as known."""
-        return self.state.lag_s
-
-    @property
-    def response(self) -> Response:
-        """The response of the sensor over that of the reference, as far as known."""
-        return self.state.response
-
-    def _record(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> Record:
-        made = Record.of(window, day, lag_s, temperature_degc, self.state.reference, self.state.motion_to_hz)
+    def _record(self, window: Window, day: float, lag_s: float, temperature_degc: float, place: int) -> Record:
+        made = Record.of(window, day, lag_s, temperature_degc, self.state.reference(place), self.state.motion_to_hz)
         return self.state.with_body(made)
 
-    def date_certificate(self, day: float, utc_ns: int) -> None:
-        """Tell the state the date of the certificate of the reference in use. `utc_ns` is the UTC of `day`."""
-        dated = self._beside[self._place].certificate.date
+    def date_certificate(self, day: float, utc_ns: int, place: int = FIRST) -> None:
+        """Tell the state the date of the certificate of the reference at a place. `utc_ns` is the UTC of `day`."""
+        dated = self._beside[place].certificate.date
         before_s = None if dated is None else utc_ns * 1e-9 - dated.timestamp()
-        self.state.date_certificate(None if before_s is None else day - before_s / DAY_S)
+        self.state.date_certificate(None if before_s is None else day - before_s / DAY_S, place)
 
-    def after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float) -> State:
-        """The state once these windows, made with `lag_s` taken out, were taken."""
-        trial = self._tried_of(windows[0], day, lag_s, temperature_degc).after
+    def after(self, windows: Sequence[Window], day: float, lag_s: float, temperature_degc: float, place: int) -> State:
+        """The state once these windows beside the reference at a place, made with `lag_s` taken out, were taken."""
+        trial = self._tried_of(windows[0], day, lag_s, temperature_degc, place).after
         for window in windows[1:]:
-            _, trial = trial.with_window(self._record(window, day, lag_s, temperature_degc))
+            _, trial = trial.with_window(self._record(window, day, lag_s, temperature_degc, place))
         return trial
 
-    def contradicted(self, found: StretchWindows, day: float, lag_s: float) -> bool:
+    def contradicted(self, found: StretchWindows, day: float, lag_s: float, place: int) -> bool:
         """Whether a window, made with `lag_s` taken out, contradicts the state, or does not follow the reference."""
         for window in found.windows:
             if not window.used:
                 if window.numbers.get("coherence", 1.0) < window.numbers.get("coherence_threshold", 0.0):
                     return True
                 continue
-            tried = self._tried_of(window, day, lag_s, found.temperature_degc)
+            tried = self._tried_of(window, day, lag_s, found.temperature_degc, place)
             if tried.innovation.statistic > self.gate.limit(tried.innovation.degrees_of_freedom):
                 return True
         return False
 
     def judge(
-        self, window: Window, day: float, lag_s: float, temperature_degc: float, anew: Anew | None = None
+        self,
+        window: Window,
+        day: float,
+        lag_s: float,
+        temperature_degc: float,
+        anew: Anew | None = None,
+        place: int = FIRST,
     ) -> Judged:
-        """Take, hold or refuse one used window. `anew`: the search that found its lag, if there was one."""
+        """Take, hold or refuse one used window beside the reference at a place. `anew`: the search that found its lag,
+        if there was one."""
         told, whole = self._before_window(day)
         if anew is not None:
-            self._use_lag(anew)
-            record = self._record(window, day, lag_s, temperature_degc)
+            self._use_lag(anew, place)
+            record = self._record(window, day, lag_s, temperature_degc, place)
             tried = TrialWindow(window.sums, record, *self.state.tried(record, at_its_lag=True))
         else:
-            tried = self._tried_of(window, day, lag_s, temperature_degc)
+            tried = self._tried_of(window, day, lag_s, temperature_degc, place)
         self._tried = None
         noise_news, earlier, followed = self.noise.update(tried.record, self.state.scale), self.state, ""
-        candidate = tried.after.result()
+        candidate = tried.after.result(place)
         held = [*self._held, tried.record][-self._channel.gate.confirm_windows :]
-        jump = self._jump(held)
-        decision = self.gate.judge(
-            self._evidence(window, day, tried), candidate, None if jump.state is None else jump.state.result()
-        )
+        jump = self._jump(held, place)
+        proposed = None if jump.state is None else jump.state.result(place)
+        decision = self.gate.judge(self._evidence(window, day, tried), candidate, proposed)
         if decision.action == "take":
             self.state = tried.after
         elif decision.action == "adopt":
-            decision, whole = self._adopt(jump, decision, held[0].day, tried)
+            decision, whole = self._adopt(jump, decision, held[0].day, tried, place)
         self._hold(held if decision.action == "hold" else self._held, day * DAY_S, at_once=jump.at_once)
         if decision.action in ("take", "hold"):
             told += self._drifted(day, tried.innovation)
             if not self.gate.held:  # else it is for windows that agree to confirm it
-                followed = self._follow(tried.record)
+                followed = self._follow(tried.record, place)
         if decision.in_force:
             self.residual_sd = self.state.residual_sd
-            self._update_in_force(whole, tried.record if decision.action == "take" else None)
+            self._update_in_force(place, whole, tried.record if decision.action == "take" else None)
         if decision.action == "hold":
-            self._propose(decision, tried.after if decision.proposal is candidate else jump.state)
-            why = self.lag_watch.beyond or most_likely(tried.innovation, self.state.scale, self.gate.limit)
+            self._propose(decision, tried.after if decision.proposal is candidate else jump.state, place)
+            why = self._lag_watches[place].beyond or most_likely(tried.innovation, self.state.scale, self.gate.limit)
             decision = replace(decision, reason=f"{decision.reason}; {why}")
-        news = (noise_news, self._news(earlier) if decision.action in ("take", "adopt") else "", followed)
+        news = (noise_news, self._news(earlier, place) if decision.action in ("take", "adopt") else "", followed)
         return Judged(decision, tried.innovation, told, "; ".join(filter(None, news)))
 
-    def _use_lag(self, anew: Anew) -> None:
+    def _use_lag(self, anew: Anew, place: int) -> None:
         """Take the state in which a search has found the lag of the newest window."""
         if anew.shifted:
-            self.lag_watch.shifted(self.state)
+            self._lag_watches[place].shifted(self.state)
             self.state = anew.base
             self.gate.dismiss()  # windows held before were made with another lag
             self._held = []
@@ -252,22 +238,24 @@ class Estimation:
             still="" if self.gate.calibrated else where_nothing_moved(tried.after.unexcited),
         )  # fmt: skip
 
-    def _jump(self, held: Sequence[Record]) -> Jump:
-        """What as many held windows as confirm a jump ask for. Outputs that were exchanged or rescaled are looked for
-        until they are found."""
+    def _jump(self, held: Sequence[Record], place: int) -> Jump:
+        """What as many held windows as confirm a jump ask for; the newest one is beside the reference at a place.
+        Outputs that were exchanged or rescaled are looked for until they are found."""
         limit = self.gate.limit
-        if len(held) < self._channel.gate.confirm_windows or self.lag_watch.beyond:
+        if len(held) < self._channel.gate.confirm_windows or self._lag_watches[place].beyond:
             return Jump(None)
-        adopted, who = confirmed(self.state, held, self._devices, limit)
+        adopted, who = confirmed(self.state, held, self._devices(place), limit)
         if self._exchanged or (found := exchanged(self.state, held, limit)) is None:
             return Jump(adopted, who)
         if motion_across(self.state, held):
             return Jump(adopted, who)
         if found.scale is not None:
-            adopted = rescaled(self.state, held, found.scale, limit) or adopted
+            adopted = rescaled(self.state, held, found.scale, limit, place) or adopted
         return Jump(adopted, who, at_once=True)
 
-    def _adopt(self, jump: Jump, decision: Decision, day: float, tried: TrialWindow) -> tuple[Decision, Estimate]:
+    def _adopt(
+        self, jump: Jump, decision: Decision, day: float, tried: TrialWindow, place: int
+    ) -> tuple[Decision, Estimate]:
         """Go on with the state that held windows ask for, the first of which is of a day. Returns the decision with
         what the change looks like, and the whole solved anew."""
         assert jump.state is not None
@@ -275,7 +263,7 @@ class Estimation:
         whole = self.state.solve()
         self.drift.restart(tried.innovation.information > 0.0)
         self.walks.restart()
-        shape = "" if jump.at_once else self._shape(day, tried.record)
+        shape = "" if jump.at_once else self._shape(day, tried.record, place)
         return replace(decision, reason="; ".join(filter(None, (f"{decision.reason}{jump.who}", shape)))), whole
 
     def _hold(self, held: Sequence[Record], now_s: float, *, at_once: bool) -> None:
@@ -293,16 +281,16 @@ class Estimation:
         changed = self.drift.update(day * DAY_S, innovation.score, innovation.information)
         return [v for v in changed if v.verdict != "stable" or v.parameter not in self.walks.drifting]
 
-    def _propose(self, decision: Decision, made: State | None) -> None:
+    def _propose(self, decision: Decision, made: State | None, place: int) -> None:
         """Keep the proposal of a decision, if it has one, with the state from which it was made."""
         if decision.proposal is not None:
             assert made is not None
-            proposal = Proposal(decision.proposal, *made.beyond(self.state), made.shares)
+            proposal = Proposal(decision.proposal, *made.beyond(self.state), made.shares(place))
             self._proposed = [*self._proposed, proposal][-PROPOSALS_KEPT:]
 
-    def _news(self, earlier: State) -> str:
+    def _news(self, earlier: State, place: int) -> str:
         """What the newest window, which was taken, has changed besides S and Q."""
-        return "; ".join(filter(None, (self.lag_watch.taken(self.state), self.state.settled_since(earlier))))
+        return "; ".join(filter(None, (self._lag_watches[place].taken(self.state), self.state.settled_since(earlier))))
 
     def _before_window(self, day: float) -> tuple[list[DriftVerdict], Estimate | None]:
         """Old records are merged; at the first window of a day, net changes of S and Q are judged before. Returns what
@@ -326,8 +314,8 @@ class Estimation:
         if self._explain_s is None or now_s < self._explain_s:
             return ""
         self._explain_s = now_s + self._channel.gate.explain_after_s
-        if self.lag_watch.beyond:
-            return f"the held windows show another lag: {self.lag_watch.beyond}"
+        if beyond := self._lag_watches[FIRST].beyond:
+            return f"the held windows show another lag: {beyond}"
         if across := motion_across(self.state, self._held):
             return across
         if (found := exchanged(self.state, self._held, self.gate.limit)) is not None:
@@ -355,18 +343,19 @@ class Estimation:
                 return self.gate.number_of(made.calibration)
         return None
 
-    def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float) -> TrialWindow:
+    def _tried_of(self, window: Window, day: float, lag_s: float, temperature_degc: float, place: int) -> TrialWindow:
         """The window tried on the state; the newest one is not tried again."""
         tried = self._tried
         if tried is None or tried.window_sums is not window.sums or tried.record.lag_s != lag_s:
-            record = self._record(window, day, lag_s, temperature_degc)
+            record = self._record(window, day, lag_s, temperature_degc, place)
             self._tried = tried = TrialWindow(window.sums, record, *self.state.tried(record))
         return tried
 
-    def shares_of(self, calibration: Calibration) -> Sequence[ReferenceShare]:
-        """What a calibration owes to the references, where that is known."""
-        if np.array_equal(self.state.covariance, calibration.covariance):
-            return self.state.shares
+    def shares_of(self, calibration: Calibration, place: int) -> Sequence[ReferenceShare]:
+        """What a calibration, of which U is beside the reference at a place, owes to the references, where that is
+        known."""
+        if np.array_equal(self.state.covariance(place), calibration.covariance):
+            return self.state.shares(place)
         proposal = self._proposal_of(calibration)
         return () if proposal is None else proposal.shares
 
@@ -419,19 +408,19 @@ class Estimation:
         self.law = replace(law, mean=mean, covariance=covariance, determined=calibration.determined)
         self._held, self._proposed = [], []
 
-    def meet(self, reference: str, calibrated: str, sensitivity: float) -> bool:
-        """The reference that is connected now, and its certificate (see State.meet).
+    def meet(self, reference: str, calibrated: str, sensitivity: float, place: int = FIRST) -> bool:
+        """The reference that is connected now at a place, and its certificate (see State.meet).
 
         Held windows of another reference are dropped. Returns whether the calibration in force changed.
         """
-        before, follows = self.state.reference, self.follows_state()
-        if changed := self.state.meet(reference, calibrated, sensitivity):
+        before, follows = self.state.reference(place), self.follows_state(place)
+        if changed := self.state.meet(reference, calibrated, sensitivity, place):
             self.walks.restart()
-        if before not in ("", self.state.reference):
+        if before not in ("", self.state.reference(place)):
             self.gate.dismiss()
-            self.lag_watch.forget()
+            self._lag_watches[place].forget()
             self._held, self._proposed = [], []
-        return changed and follows and self._update_in_force()
+        return changed and follows and self._update_in_force(place)
 
     def restate(self, gravity_mps2: tuple[float, float] | None, *, remounted: bool, size: float | None = None) -> bool:
         """After `load` of a state that was made with another configuration: see State.restate.
@@ -443,43 +432,42 @@ class Estimation:
         if size is not None:
             u_S = (size - 1.0) * self.state.result().sensitivity.ravel()
             for place in range(len(self._beside)):
-                self.use(place)
-                self.state.step(self.state.changes(np.append(u_S, np.zeros(3)), line=True, another_filter=np.inf))
+                u = np.append(u_S, np.zeros(3))
+                self.state.step(self.state.changes(u, place=place, line=True, another_filter=np.inf))
                 u_S = np.zeros(9)
-            self.use(0)
             self._held = []
         if remounted:
-            self.state.remount(of_reference=False)
+            self.state.remount()
             self._held = []
         changed = self.state.restate(gravity_mps2) or size is not None
         if changed or remounted:
             self.walks.restart()
         return changed and follows and self._update_in_force()
 
-    def follows_state(self) -> bool:
-        """Whether the calibration in force is that of the state, but for rounding."""
-        now, u = self.state.result(), self.in_force.standard_uncertainty
+    def follows_state(self, place: int = FIRST) -> bool:
+        """Whether the calibration in force is that of the state beside the reference at a place, but for rounding."""
+        now, u = self.state.result(place), self.in_force.standard_uncertainty
         moved = np.append(now.sensitivity - self.in_force.sensitivity, now.offset - self.in_force.offset)
         return self.gate.calibrated and bool(np.all(np.abs([moved, now.standard_uncertainty - u]) <= SAME * u))
 
-    def _update_in_force(self, whole: Estimate | None = None, record: Record | None = None) -> bool:
-        """Put the state's S and Q in force. `whole`: the solution from which they follow, before `record` if that is
-        named. Their budget is known where the two say the same."""
-        self.in_force, self.law, self.budget = self.state.result(), self.state.law(), None
+    def _update_in_force(self, place: int = FIRST, whole: Estimate | None = None, record: Record | None = None) -> bool:
+        """Put the state's S and Q beside the reference at a place in force. `whole`: the solution from which they
+        follow, before `record` if that is named. Their budget is known where the two say the same."""
+        self.in_force, self.law, self.budget = self.state.result(place), self.state.law(place=place), None
         whole = whole.with_window(record) if whole is not None and record is not None else whole
         if whole is not None:
-            found, variances = self.state.budget(whole), self.in_force.covariance.diagonal()
+            found, variances = self.state.budget(whole, place), self.in_force.covariance.diagonal()
             if np.allclose(found.standard_uncertainty**2, variances, rtol=SAME_BUDGET, atol=0.0):
                 self.budget = found
         return True
 
-    def _shape(self, day: float, newest: Record) -> str:
+    def _shape(self, day: float, newest: Record, place: int) -> str:
         """What the change of S since the windows of a day looks like. With two references windows of both tell which
         device has changed, and none is named by one of them."""
         count = own_channels(newest.channels) if len(self._beside) == 1 else 0
-        return shape_of_change(self.state, day, newest.pose.direction[:, :count], self.gate.limit)
+        return shape_of_change(self.state, day, newest.pose.direction[:, :count], self.gate.limit, place)
 
-    def _follow(self, newest: Record) -> str:
+    def _follow(self, newest: Record, place: int) -> str:
         """Steps so small that each window alone was consistent, and drifts: the state may follow them. Returns what the
         change of S looks like, "" where nothing is followed or nothing can be said.
 
@@ -497,18 +485,18 @@ class Estimation:
         shape = ""
         if loose[:9].any():
             since_s = min(own.onset_s for own, size in zip(self.drift.result(), loose[:9], strict=False) if size)
-            shape = self._shape(since_s / DAY_S, newest)
+            shape = self._shape(since_s / DAY_S, newest, place)
         if loose.any():
             leaning_rad, of_S = tilt_rad(loose[9:], self.state.scale), float(loose[:9].max()) / self.state.scale
-            u = self.state.changes(loose, leaning_rad, u_rate=rate, another_filter=of_S)
-            self.state.step(u | self._of_reference(loose))
+            u = self.state.changes(loose, leaning_rad, place=place, u_rate=rate, another_filter=of_S)
+            self.state.step(u | self._of_reference(loose, place))
             self.drift.restart(loose > 0.0)
         return shape
 
-    def _of_reference(self, loose: Array) -> dict[str, float]:
-        """By how much the reference in use may have changed in place of S, by key; nothing if it is stated not to."""
+    def _of_reference(self, loose: Array, place: int) -> dict[str, float]:
+        """By how much the reference may have changed in place of S, by key; nothing if it is stated not to."""
         found: dict[str, float] = {}
-        if (now := self.state.shown().get(self.state.reference)) is not None:
+        if (now := self.state.shown().get(self.state.reference(place))) is not None:
             for p in np.flatnonzero(loose[:9]).tolist():
                 for key, (moves, _) in now.makers[p].items():
                     if key != PARAMETERS[p]:

@@ -134,7 +134,7 @@ def _lines(state: State, jump: Array, fixed_mount: bool) -> dict[str, list[int]]
 
     At a fixed mount the mean output stands in the place of Q; the data cannot tell a lean of the mount from it.
     """
-    quantities, lines, own = state.quantities, dict[str, list[int]](), {quantity.key for quantity in state.present}
+    quantities, lines, own = state.quantities, dict[str, list[int]](), {quantity.key for quantity in state.present()}
     for k, quantity in enumerate(quantities):
         if quantity.key not in own or quantity.name in ALL_RATES:
             continue

@@ -17,7 +17,7 @@ from agent.core.gate import Limit
 from calib.estimate.quantities import REFERENCE, REFERENCE_DRIFT, Quantity
 from calib.geometry import AXES, STANDARD_GRAVITY_MPS2
 from calib.model import Array, Calibration, own_channels
-from calib.state.state import State
+from calib.state.state import FIRST, State
 from calib.windows.record import Record
 
 # A jump that is being confirmed may be of any size up to what an operator would hardly accept: 10 % of S, and in the
@@ -46,12 +46,13 @@ class TriedStep:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The names of the reference in use and of the other one ("" if there is none), and the stability of the former in
-    a year, relative."""
+    """The names of the reference of the newest window and of the other one ("" if there is none), the stability of the
+    former in a year, relative, and its place."""
 
     own: str
     other: str
     stability: float
+    place: int = FIRST
 
 
 def confirmed(state: State, held: Sequence[Record], devices: Devices, limit: Limit) -> tuple[State | None, str]:
@@ -59,15 +60,15 @@ def confirmed(state: State, held: Sequence[Record], devices: Devices, limit: Lim
 
     None if the held windows do not agree with each other. `limit` is that of the gate.
     """
-    before = state.chi2_beside(held)
-    sensor = _tried(state, held, _of_sensor(state, held), limit, before)
+    before, place = state.chi2_beside(held), devices.place
+    sensor = _tried(state, held, place, _of_sensor(state, held, place), limit, before)
     own, other = devices.own, devices.other
     if len({record.reference for record in held}) > 1:
         told = f": windows with {own} and with {other} show the same change, so the sensor has changed"
         return (sensor.state if sensor.fits else None), told
-    channels = _channels(state)
+    channels = _channels(state, place)
     stepped = dict.fromkeys((q.key for q in channels), JUMP_SENSITIVITY / SURELY)
-    reference = _tried(state, held, state.changes(NOTHING, line=True) | stepped, limit, before)
+    reference = _tried(state, held, place, state.changes(NOTHING, place=place, line=True) | stepped, limit, before)
     # The step of the sensor has more unknowns, and so fits the better, if nothing else contradicts it.
     if reference.fits and reference.chi2 < sensor.chi2 - DECISIVE:
         why = f"windows with {other} still agree" if other else "gravity still agrees"
@@ -81,13 +82,15 @@ def confirmed(state: State, held: Sequence[Record], devices: Devices, limit: Lim
         if sensor.fits and sensor.chi2 < reference.chi2 - more - DECISIVE:
             return sensor.state, f": windows with {other} show the same change, so the sensor has changed"
         told = f": no window with {other} tells whether the sensor or the reference {own} has changed"
-    return _of_either(state, held, sensor, devices.stability, limit, before), told
+    return _of_either(state, held, sensor, devices, limit, before), told
 
 
-def rescaled(state: State, held: Sequence[Record], factor: float, limit: Limit) -> State | None:
-    """The state after held windows that show all outputs of the sensor at another scale; None if they do not agree."""
+def rescaled(state: State, held: Sequence[Record], factor: float, limit: Limit, place: int) -> State | None:
+    """The state after held windows that show all outputs of the sensor at another scale; None if they do not agree. The
+    newest one is beside the reference at a place."""
     wider = max(1.0, WIDER * abs(factor - 1.0) / JUMP_SENSITIVITY)
-    tried = _tried(state, held, _of_sensor(state, held, wider=wider), limit, state.chi2_beside(held))
+    u = _of_sensor(state, held, place, wider=wider)
+    tried = _tried(state, held, place, u, limit, state.chi2_beside(held))
     return tried.state if tried.fits else None
 
 
@@ -105,15 +108,15 @@ class Shape:
         return self.chi2 + AN_UNKNOWN * self.unknowns
 
 
-def shape_of_change(state: State, day: float, directions: Array, limit: Limit) -> str:
+def shape_of_change(state: State, day: float, directions: Array, limit: Limit, place: int = FIRST) -> str:
     """What the change of S since the windows of a day looks like, for the operator: a turn, another scale of an output,
-    of all, or of a channel of the reference, with `directions` (3, C) in the sensor's frame. "" where it is none of
-    these, or where nothing has changed.
+    of all, or of a channel of the reference at a place, with `directions` (3, C) in the sensor's frame. "" where it is
+    none of these, or where nothing has changed.
 
     The change follows from all windows, as if S and Q had stepped before this day.
     """
     size = np.append(np.full(9, JUMP_SENSITIVITY), np.full(3, JUMP_OFFSET_MPS2)) * state.scale
-    moved, covariance = state.change_on(day, state.changes(size))
+    moved, covariance = state.change_on(day, state.changes(size, place=place))
     white = np.linalg.inv(np.linalg.cholesky(covariance[:9, :9]))
     found = sorted(_shapes(moved[:9], white, state.result().sensitivity, directions), key=lambda shape: shape.score)
     best, none = found[0], Shape(float(np.sum((white @ moved[:9]) ** 2)), 0, "")
@@ -147,55 +150,62 @@ def _shapes(moved: Array, white: Array, S: Array, directions: Array) -> Iterator
         yield Shape(chi2, 1, f"{-100.0 * size:+.2g} % in channel {axis} of the reference")
 
 
-def _of_sensor(state: State, held: Sequence[Record], leaning_rad: float = 0.0, wider: float = 1.0) -> dict[str, float]:
+def _of_sensor(
+    state: State, held: Sequence[Record], place: int, leaning_rad: float = 0.0, wider: float = 1.0
+) -> dict[str, float]:
     """A line that was plugged anew may be late by another time; that is no change of S or Q."""
-    return state.changes(wider * possible_jump(state, held), leaning_rad, line=True, another_filter=np.inf)
+    jump = wider * possible_jump(state, held)
+    return state.changes(jump, leaning_rad, place=place, line=True, another_filter=np.inf)
 
 
-def _tried(state: State, held: Sequence[Record], u: Mapping[str, float], limit: Limit, before: float) -> TriedStep:
+def _tried(
+    state: State, held: Sequence[Record], place: int, u: Mapping[str, float], limit: Limit, before: float
+) -> TriedStep:
     after = state.after(held, u)
     grown = after.chi2 - before
-    fits = grown <= limit(sum(record.rows for record in held)) and not _made_otherwise(state, after, held)
+    fits = grown <= limit(sum(record.rows for record in held)) and not _made_otherwise(state, after, held, place)
     return TriedStep(after, grown, len(u), fits)
 
 
-def _made_otherwise(before: State, after: State, held: Sequence[Record]) -> bool:
+def _made_otherwise(before: State, after: State, held: Sequence[Record], place: int) -> bool:
     """Whether the held windows were made with another filter or lag taken out than is right: they tell no exact S."""
-    phase_rad = max(abs(after.lag_s - record.lag_s) * float(np.sqrt(record.omega2)) for record in held)
-    return phase_rad > LARGEST_PHASE_RAD or after.has_another_response(before)
+    lag_s = after.lag_s(place)
+    phase_rad = max(abs(lag_s - record.lag_s) * float(np.sqrt(record.omega2)) for record in held)
+    return phase_rad > LARGEST_PHASE_RAD or after.has_another_response(before, place)
 
 
 def _of_either(
-    state: State, held: Sequence[Record], sensor: TriedStep, stability: float, limit: Limit, chi2: float
+    state: State, held: Sequence[Record], sensor: TriedStep, devices: Devices, limit: Limit, chi2: float
 ) -> State | None:
     """The sensor made the step, or the reference did: S follows, and its u covers both."""
     if not sensor.fits:
         return None
-    before, after = state.result(), sensor.state.result()
+    place = devices.place
+    before, after = state.result(place), sensor.state.result(place)
     moved = np.abs(after.offset - before.offset)
     significant = moved > SIGNIFICANT * np.sqrt(_covariance_of_change(before, after).diagonal()[9:].clip(0.0))
     leaning = tilt_rad(np.where(significant, moved, 0.0), state.scale)
     found = float(np.abs(after.sensitivity - before.sensitivity).max()) / state.scale
-    u = _of_sensor(state, held, leaning, max(1.0, WIDER * found / JUMP_SENSITIVITY))
-    tried = _tried(state, held, u | _of_reference(state, held, before, after, stability), limit, chi2)
+    u = _of_sensor(state, held, place, leaning, max(1.0, WIDER * found / JUMP_SENSITIVITY))
+    tried = _tried(state, held, place, u | _of_reference(state, held, before, after, devices), limit, chi2)
     return tried.state if tried.fits else None
 
 
 def _of_reference(
-    state: State, held: Sequence[Record], before: Calibration, after: Calibration, stability: float
+    state: State, held: Sequence[Record], before: Calibration, after: Calibration, devices: Devices
 ) -> dict[str, float]:
     """By how much the reference may have stepped, relative, by the key of its drift: it indicates more by the part by
     which S times the direction of a channel is larger."""
     found, change = {}, after.sensitivity - before.sensitivity
     covariance = _covariance_of_change(before, after)[:9, :9]
-    drifts = [quantity for quantity in state.present if quantity.kind is REFERENCE_DRIFT]
+    drifts = [quantity for quantity in state.present(devices.place) if quantity.kind is REFERENCE_DRIFT]
     direction = held[0].pose.direction[:, : own_channels(held[0].channels)]
     for quantity, way in zip(drifts, direction.T, strict=False):
         output = before.sensitivity @ way
         by = np.kron(output, way) / (output @ output)  # of the relative step, by the elements of S
         step, u = float(by @ change.ravel()), float(np.sqrt(max(by @ covariance @ by, 0.0)))
         if abs(step) > SIGNIFICANT * u:
-            found[quantity.key] = max(stability, abs(step) / SURELY)
+            found[quantity.key] = max(devices.stability, abs(step) / SURELY)
     return found
 
 
@@ -205,10 +215,11 @@ def _covariance_of_change(before: Calibration, after: Calibration) -> Array:
     return np.asarray(after.covariance - before.covariance)
 
 
-def _channels(state: State) -> list[Quantity]:
-    """What a step of the reference in use changes: its drift, or its sensitivity if it is stated not to drift."""
-    drifts = [quantity for quantity in state.present if quantity.kind is REFERENCE_DRIFT]
-    return drifts or [quantity for quantity in state.present if quantity.kind is REFERENCE]
+def _channels(state: State, place: int) -> list[Quantity]:
+    """What a step of the reference at a place changes: its drift, or its sensitivity if it is stated not to drift."""
+    present = state.present(place)
+    drifts = [quantity for quantity in present if quantity.kind is REFERENCE_DRIFT]
+    return drifts or [quantity for quantity in present if quantity.kind is REFERENCE]
 
 
 def _sizes(before: State, after: State, channels: Sequence[Quantity]) -> str:

@@ -26,7 +26,7 @@ from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import ResponseTold
 from calib.model import Array, Calibration, Window
 from calib.state.sources import Sources
-from calib.state.state import State
+from calib.state.state import FIRST, State
 
 UNCERTAINTY = "combined"
 MOST_TEMPERATURE_ORDER = 2
@@ -48,15 +48,18 @@ def calibration_update(
     state: State,
     shares: Sequence[ReferenceShare],
     certificate_of: Callable[[str], Certificate | None],
+    place: int = FIRST,
 ) -> CalibrationUpdate:
-    """S and Q with temperature coefficients, drift rates and the number of windows.
+    """S and Q with temperature coefficients, drift rates, the number of windows, and the response beside the reference
+    at a place.
 
     `shares`: what S and Q owe to the references, empty where that is not known. `certificate_of` a reference: None if
     it is not connected.
     """
-    powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in state.names]
+    names = state.names(place)
+    powers = [k for k in range(1, MOST_TEMPERATURE_ORDER + 1) if offset_temperature(k)[0] in names]
     by_power = [_both(state, offset_temperature(k)) for k in powers]
-    rows = [SENSITIVITY_PER_K[k : k + 3] for k in range(0, 9, 3)] if SENSITIVITY_PER_K[0] in state.names else []
+    rows = [SENSITIVITY_PER_K[k : k + 3] for k in range(0, 9, 3)] if SENSITIVITY_PER_K[0] in names else []
     by_row = [_both(state, row) for row in rows]
     rate, u_rate = _both(state, RATES)
     low, high = state.temperature_range_degc
@@ -72,7 +75,7 @@ def calibration_update(
         offset_temperature=[value for value, _ in by_power], u_offset_temperature=[u for _, u in by_power],
         sensitivity_per_k=[value for value, _ in by_row], u_sensitivity_per_k=[u for _, u in by_row],
         offset_rate=rate, u_offset_rate=u_rate, references=[name for name in state.references if name],
-        reference_frequency_hz=state.reference_frequency_hz, **_over_frequency(state.response_told),
+        reference_frequency_hz=state.reference_frequency_hz, **_over_frequency(state.response_told(place)),
         shared_errors=_shared_errors(shares, certificate_of),
     )  # fmt: skip
 

@@ -40,9 +40,8 @@ class References:
         for place, beside in enumerate(self._beside):
             if estimation is not None and self.identities[place] and not self.not_certified[place]:
                 certificate = beside.certificate
-                estimation.use(place)
-                changed |= estimation.meet(self.identities[place], certificate.calibrated, certificate.sensitivity)
-                estimation.use(0)
+                own = self.identities[place], certificate.calibrated, certificate.sensitivity
+                changed |= estimation.meet(*own, place)
         return changed
 
     def certificate_of(self, reference: str) -> Certificate | None:

@@ -232,7 +232,7 @@ class Streams:
         for window in found.windows:
             judged = None
             if window.used and estimation is not None:
-                judged = estimation.judge(window, day, lag_s, found.temperature_degc, anew)
+                judged = estimation.judge(window, day, lag_s, found.temperature_degc, anew, self.place)
                 anew = None  # the first window has set the lag in the state
             yield JudgedWindow(window, judged, lag_s)
 
@@ -312,28 +312,28 @@ class Streams:
         """The windows, made again until neither a lag nor a response is left in them that matters; what a search for
         another lag found."""
         if estimation is None or self._channel.reference is None:
-            lag_s = 0.0 if estimation is None else estimation.lag_s
+            lag_s = 0.0 if estimation is None else estimation.state.lag_s(self.place)
             return self._make(piece, first_s, FLAT, np.inf, lag_s), lag_s, None
-        lag_s, response = estimation.lag_s, estimation.response
-        trial, known = estimation.state, estimation.state.response_is_known
+        trial, place = estimation.state, self.place
+        lag_s, response, known = trial.lag_s(place), trial.response(place), trial.response_is_known(place)
 
         def lag_of(found: StretchWindows, lag_s: float) -> float:
             nonlocal trial
             # What contradicts a known state must not move its lag: that would be an answer to another question.
-            if known and estimation.contradicted(found, day, lag_s):
+            if known and estimation.contradicted(found, day, lag_s, place):
                 return lag_s
-            trial = estimation.after(found.used, day, lag_s, found.temperature_degc)
-            return trial.lag_s
+            trial = estimation.after(found.used, day, lag_s, found.temperature_degc, place)
+            return trial.lag_s(place)
 
         for _ in range(RESPONSE_TURNS):
             make = partial(self._make, piece, first_s, response, estimation.state.motion_to_hz)
             found, lag_s = without_lag(lag_s, make, lambda found: found.used, lag_of)
-            if known or not found.used or trial.response_is(response):
+            if known or not found.used or trial.response_is(response, place):
                 break
-            response = trial.response.modest
+            response = trial.response(place).modest
         else:
             return found.refused(UNSETTLED), lag_s, None
-        if estimation.contradicted(found, day, lag_s):
+        if estimation.contradicted(found, day, lag_s, place):
             return self._explained(piece, first_s, day, estimation, found, lag_s, response)
         return found, lag_s, None
 
@@ -349,14 +349,14 @@ class Streams:
     ) -> tuple[StretchWindows, float, Anew | None]:
         """As `_found`, of windows that contradict: those of the part whose samples have the known lag, where others
         have not; else those at another lag, if one explains them; else what was found."""
-        state, watch, to_hz = estimation.state, estimation.lag_watch, estimation.state.motion_to_hz
+        state, watch, to_hz = estimation.state, estimation.lag_watch(self.place), estimation.state.motion_to_hz
         samples = aligned_in(piece, first_s, self._beside[self.place], self.by_device, lag_s, response, to_hz)
         if samples is None:
             return found, lag_s, None
         if (part_s := watch.part_in_time(state, piece.pose, samples, lag_s)) is not None:
             part = replace(piece, start_s=part_s[0] - first_s, stop_s=part_s[1] - first_s)
             within = self._make(part, first_s, response, to_hz, lag_s)
-            if within.used and not estimation.contradicted(within, day, lag_s):
+            if within.used and not estimation.contradicted(within, day, lag_s, self.place):
                 time_s = samples.points.time_s
                 count = np.count_nonzero((time_s < part_s[0]) | (time_s > part_s[1]))
                 return within.told({"misplaced_samples": float(count)}), lag_s, None

@@ -70,10 +70,11 @@ class LagChange:
 
 
 class LagWatch:
-    """Watches the lag of one channel: searches it anew, sets it free after a restart, and tells when it has shifted."""
+    """Watches the lag of one channel behind the reference at a place: searches it anew, sets it free after a restart,
+    and tells when it has shifted."""
 
-    def __init__(self, channel: Channel, limit: Limit) -> None:
-        self._channel, self._limit = channel, limit
+    def __init__(self, channel: Channel, place: int, limit: Limit) -> None:
+        self._channel, self._place, self._limit = channel, place, limit
         self._priors = channel.priors(fixed_mount=channel.fixed_mount)
         self._line: LagChange | None = None
         self._excluded_s: float | None = None  # the lag at which the newest search failed
@@ -106,7 +107,7 @@ class LagWatch:
         self._unexplained += 1
         if self._unexplained & (self._unexplained - 1):
             return None
-        anew = search(state, self._priors, self._limit, make, contradicting, lag_s, lags_s, day)
+        anew = search(state, self._place, self._priors, self._limit, make, contradicting, lag_s, lags_s, day)
         self.beyond = "" if anew is None else anew.beyond
         return anew
 
@@ -121,17 +122,17 @@ class LagWatch:
 
     def began(self, state: State, device: str) -> None:
         """A device or its line began anew: it may be late by another time from now on, as far as stated."""
-        if "lag" not in state.names:
+        if "lag" not in state.names(self._place):
             return
         if self._line is None:
             self.shifted(state)
-            state.step(state.changes(np.zeros(12), line=True))
+            state.step(state.changes(np.zeros(12), place=self._place, line=True))
         if self._line is not None and device not in self._line.devices:
             self._line.devices.append(device)
 
     def shifted(self, state: State) -> None:
         """The lag is another now than in `state`."""
-        self._line = self._line or LagChange(*state.quantity("lag"), [])
+        self._line = self._line or LagChange(*state.quantity("lag", self._place), [])
 
     def forget(self) -> None:
         """Another reference has a lag of its own."""
@@ -143,7 +144,8 @@ class LagWatch:
         self.forget()
         if line is None or self._channel.reference is None:
             return ""
-        return line.told(*state.quantity("lag"), self._channel.sensor, self._channel.reference)
+        lag = state.quantity("lag", self._place)
+        return line.told(*lag, self._channel.sensor, self._channel.reference)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
@@ -189,6 +191,7 @@ def _expected(state: State, pose: Pose, samples: Aligned) -> Array:
 
 def search(
     state: State,
+    place: int,
     priors: Priors,
     limit: Limit,
     make: Callable[[float], StretchWindows],
@@ -197,24 +200,25 @@ def search(
     lags_s: Sequence[float],
     day: float,
 ) -> Anew | None:
-    """Search the lag anew from `lags_s` on, one after the other; None if no lag explains the windows.
+    """Search the lag behind the reference at a place anew from `lags_s` on, one after the other; None if no lag
+    explains the windows.
 
     `make(lag_s)` makes the windows again with this lag taken out; `contradicting` are those with `taken_s` taken out.
     Of a lag near `taken_s` they tell themselves that it does not explain them.
     """
     loose = state.copy()
-    loose.step(loose.changes(np.zeros(12), line=True))
+    loose.step(loose.changes(np.zeros(12), place=place, line=True))
     mean_s, within_s, _ = _ranges(priors)
 
     def with_records(found: StretchWindows, lag_s: float) -> tuple[StretchWindows, list[Record]]:
-        told = lag_s, found.temperature_degc, state.reference, state.motion_to_hz
+        told = lag_s, found.temperature_degc, state.reference(place), state.motion_to_hz
         return found, [Record.of(window, day, *told) for window in found.used]
 
     def made(lag_s: float) -> tuple[StretchWindows, list[Record]]:
         return with_records(make(lag_s), lag_s)
 
     def lag_after(made: tuple[StretchWindows, list[Record]], _: float) -> float:
-        return loose.lag_with(max(made[1], key=lambda record: record.count))
+        return loose.lag_with(max(made[1], key=lambda record: record.count), place)
 
     before = with_records(contradicting, taken_s)[1]
     near_s = NEAR_RAD / max(largest_omega(contradicting.windows), np.finfo(float).tiny)

@@ -205,7 +205,7 @@ def after(windows: Sequence[Window], band_hz: tuple[float, float] | None = None)
 
 def take(state: State, own: Window, k: int) -> None:
     """The state takes window number `k`."""
-    state.update(Record.of(own, k / 24.0, state.lag_s, to_hz=state.motion_to_hz))
+    state.update(Record.of(own, k / 24.0, state.lag_s(), to_hz=state.motion_to_hz))
 
 
 def judged(state: State) -> tuple[float, float]:

@@ -60,6 +60,7 @@ OF_REFERENCES = [  # what belongs to a place is as it is stated now, whichever r
     if s.name in PRIORS
 ]
 STILL = 1e-3  # of the windows that move in the direction in which most do: so few are rounding errors, and small turns
+FIRST = 0  # the place of the first reference
 MOVED_U = 0.3  # standard uncertainties: what is not linear within so little is far below u
 Jump = Mapping[str, float]
 
@@ -80,8 +81,8 @@ class State:
 
     `mean`, `standard_uncertainty` (12,): what was known of S, Q beforehand, in output units; `fixed` mounts do not
     turn. Days count from any origin. `check`: the priors beside further references, which are mounted all the time as
-    the first one is. The first has place 0, the next one has place 1. `band_hz`: the ends in Hz of the motion that is
-    used; None: windows settle it.
+    the first one is. The first has place 0, the next one has place 1; what depends on the reference is of the one at
+    the `place` that is named. `band_hz`: the ends in Hz of the motion that is used; None: windows settle it.
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class State:
         self._priors, self._wander, self._temperature = [priors, *check], wander, temperature
         self._body: tuple[float, float] | None = None  # the day, and the temperature that a slow body has then
         self._zero_degc: float | None = None  # of S and Q, where the first window settles it
-        self._fixed, self._place = fixed, 0
+        self._fixed = fixed
         self.scale = scale_of(self._mean)
         self._present = [""] * len(self._priors)  # the references by place
         self._met: dict[str, Mounted] = {}  # every reference that was connected, last use last
@@ -113,7 +114,7 @@ class State:
         self._over = OverFrequency().stating(band_hz)
         self._held_mps2: Array | None = None  # mean input acceleration of a mount that never turned so far
         self._now = estimate([], self.statements).now
-        self._read: tuple[Now, str, Array, Array] | None = None  # what `_values` found
+        self._read: tuple[Now, str, Array, Array] | None = None  # what `_values` found, beside which reference
         self._stated_then: Any = None  # what was stated when a loaded state was kept, if that is another now
         self._newest_day: int | None = None  # of the data; None before any window
         self.windows, self._merged_at = 0, 0  # windows that were taken: until now, and when records were merged last
@@ -157,10 +158,9 @@ class State:
         kept = float(np.exp(-abs(record.day - day) / BODY_DAYS))
         return replace(record, behind_k=kept * (degc - record.temperature_degc))
 
-    @property
-    def reference(self) -> str:
-        """The reference in use: that of the next windows."""
-        return self._present[self._place]
+    def reference(self, place: int = FIRST) -> str:
+        """The reference that is at a place now."""
+        return self._present[place]
 
     def innovation(self, record: Record, *, at_its_lag: bool = False) -> Innovation:
         """What the window says against the state at its time.
@@ -180,11 +180,12 @@ class State:
         told, trial, used, ahead, rows = self._against(record, at_its_lag)
         return told, partial(trial._take, used, ahead, rows)
 
-    def lag_with(self, record: Record) -> float:
-        """The lag once a window is taken, by its equations linearised at the lag that was taken out of it."""
+    def lag_with(self, record: Record, place: int = FIRST) -> float:
+        """The lag once a window of the reference at a place is taken, by its equations linearised at the lag that was
+        taken out of it."""
         _, trial, record, ahead, rows = self._against(record, at_its_lag=True)
         trial._now = ahead.with_window(record, rows)
-        return trial.lag_s
+        return trial.lag_s(place)
 
     def _against(self, record: Record, at_its_lag: bool) -> tuple[Innovation, Self, Record, Now, Array]:
         trial = self.copy()
@@ -206,48 +207,45 @@ class State:
         """A window with the directions that it excites, as all windows until now tell them."""
         return together([*self._records, record], fixed=self._mean_is_held)[-1] if record.planar else record
 
-    def _key(self, name: str) -> str:
-        """The key of an unknown of the sensor, its mount, or the reference in use by its name or its key."""
-        of = [f"{name} of {owner}" for owner in (self.reference, f"place {self._place}") if owner]
+    def _key(self, name: str, place: int) -> str:
+        """The key of an unknown of the sensor, its mount, or the reference at a place by its name or its key."""
+        of = [f"{name} of {owner}" for owner in (self.reference(place), f"place {place}") if owner]
         return next((key for key in (*of, name) if key in self._now), name)
 
-    @property
-    def lag_s(self) -> float:
+    def lag_s(self, place: int = FIRST) -> float:
         """By how much the sensor is later than the reference; as stated before any window told."""
-        key = _lag_of(self.reference)
+        key = _lag_of(self.reference(place))
         if key in self._now:
             return float(self._now.mean[self._now.index(key)])
-        return self._priors[self._place].of(LAG.mean)
+        return self._priors[place].of(LAG.mean)
 
-    @property
-    def response(self) -> Response:
-        """The response of the sensor over that of the reference in use, to take out of the next window."""
-        before = (record.response for record in reversed(self._records) if record.reference == self.reference)
-        return self._over.response(self._now, self.reference, next(before, ()))
+    def response(self, place: int = FIRST) -> Response:
+        """The response of the sensor over that of the reference, to take out of its next window."""
+        reference = self.reference(place)
+        before = (record.response for record in reversed(self._records) if record.reference == reference)
+        return self._over.response(self._now, reference, next(before, ()))
 
-    @property
-    def response_is_known(self) -> bool:
+    def response_is_known(self, place: int = FIRST) -> bool:
         """Whether windows have told it: one more cannot change it much."""
-        return self._over.is_known(self._now, self.reference)
+        return self._over.is_known(self._now, self.reference(place))
 
-    def response_is(self, taken: Response) -> bool:
+    def response_is(self, taken: Response, place: int = FIRST) -> bool:
         """Whether it is the one that was taken out of a window, but for a part of its uncertainty."""
-        return self._over.is_taken_out(taken, self._now, self.reference)
+        return self._over.is_taken_out(taken, self._now, self.reference(place))
 
-    def response_change(self, since: State) -> tuple[float, float]:
+    def response_change(self, since: State, place: int = FIRST) -> tuple[float, float]:
         """The upper end of the motion in Hz, and by how much S is larger there than it was, relative."""
         to_hz = self._over.motion_hz[1] if self._over.motion_hz else self._over.first_hz
-        now, before = (one._over.log_h(one._now, self.reference, to_hz) for one in (self, since))
+        now, before = (one._over.log_h(one._now, self.reference(place), to_hz) for one in (self, since))
         return to_hz, float(np.expm1(now - before))
 
-    def has_another_response(self, than: State) -> bool:
-        """Whether the response beside the reference in use is surely another than in an earlier state."""
-        return self._over.differs(self._now, than._now, self.reference)
+    def has_another_response(self, than: State, place: int = FIRST) -> bool:
+        """Whether the response beside the reference is surely another than in an earlier state."""
+        return self._over.differs(self._now, than._now, self.reference(place))
 
-    @property
-    def response_told(self) -> ResponseTold | None:
+    def response_told(self, place: int = FIRST) -> ResponseTold | None:
         """What is known of it, by frequency; None where it is no unknown."""
-        return self._over.told(self._now, self.reference, self._priors[0], self.coverage_factor)
+        return self._over.told(self._now, self.reference(place), self._priors[0], self.coverage_factor)
 
     @property
     def reference_frequency_hz(self) -> float:
@@ -273,37 +271,40 @@ class State:
     def _determined(self, mean: Array, covariance: Array) -> Flags:
         return determined(mean, np.sqrt(covariance.diagonal()), self._u, np.ones(12, dtype=bool))
 
-    def result(self) -> Calibration:
-        """S and Q as they are; where a parameter is not determined, still what was known beforehand of it."""
-        mean, covariance = self._parameters()
+    def result(self, place: int = FIRST) -> Calibration:
+        """S and Q as they are; where a parameter is not determined, still what was known beforehand of it.
+
+        U contains what the response beside the reference at a place leaves open.
+        """
+        mean, covariance = self._parameters(place)
         freedom = self._now.noise.degrees_of_freedom or np.inf
         told = self._determined(mean, covariance)
         return Calibration(mean[:9].reshape(3, 3), mean[9:], covariance, told, freedom, METHOD)
 
-    @property
-    def covariance(self) -> Array:
+    def covariance(self, place: int = FIRST) -> Array:
         """(12, 12) that of `result`."""
-        return self._parameters()[1]
+        return self._parameters(place)[1]
 
     @property
     def coverage_factor(self) -> float:
         """For about 95 % coverage."""
         return self._now.coverage_factor
 
-    def _parameters(self) -> tuple[Array, Array]:
+    def _parameters(self, place: int) -> tuple[Array, Array]:
         """S and Q (12,) and their covariance."""
-        mean, factor = self._values()
+        mean, factor = self._values(place)
         return mean[:12], np.asarray(factor[:12] @ factor[:12].T)
 
-    def _values(self) -> tuple[Array, Array]:
+    def _values(self, place: int) -> tuple[Array, Array]:
         """All unknowns (N,) and a factor of their covariance, with what the response over frequency adds to it; Q where
         the mean output of a fixed mount stands."""
-        if self._read is None or self._read[0] is not self._now or self._read[1] != self.reference:
-            self._read = self._now, self.reference, *self._values_of(self._now)
+        reference = self.reference(place)
+        if self._read is None or self._read[0] is not self._now or self._read[1] != reference:
+            self._read = self._now, reference, *self._values_of(self._now, reference)
         return self._read[2], self._read[3]
 
-    def _values_of(self, now: Now) -> tuple[Array, Array]:
-        mean, factor = now.mean.copy(), self._over.factor(now, self.reference, self._priors[0]).copy()
+    def _values_of(self, now: Now, reference: str) -> tuple[Array, Array]:
+        mean, factor = now.mean.copy(), self._over.factor(now, reference, self._priors[0]).copy()
         if (under_gravity := self._under_gravity(now)) is not None:
             more, by = under_gravity
             mean[9:12] -= more
@@ -334,13 +335,13 @@ class State:
         S, away = now.mean[:9].reshape(3, 3), record.held_mps2 - self._held_mps2
         return under - S @ away, by - np.kron(np.eye(3), away) @ np.eye(9, len(now))
 
-    def law(self, day: float | None = None) -> Law:
+    def law(self, day: float | None = None, place: int = FIRST) -> Law:
         """S and Q over temperature, with all that their covariance knows of each other; `day`: wandered on until it."""
         if day is not None:
             waited = self.copy()
             waited._now = self._now.passed_to(day)
-            return waited.law()
-        return self._law(self._now, *self._values())
+            return waited.law(place=place)
+        return self._law(self._now, *self._values(place))
 
     def _law(self, now: Now, mean: Array, factor: Array) -> Law:
         temperature = self._over_temperature
@@ -382,7 +383,7 @@ class State:
         whole, laws, changes = self.estimate(also=epoch_days(counts, stated)), list[Law](), list[StatedChange]()
         days = whole.days.tolist()
         for then, after in zip(whole.past(), [np.inf, *reversed(days)], strict=False):
-            laws.append(self._law(then.now, *self._values_of(then.now)))
+            laws.append(self._law(then.now, *self._values_of(then.now, self.reference())))
             if after in stated:
                 dated = self._dated_by(whole, then, after, [begin, *stated, days[-1]])
                 changes.append(StatedChange(after, stated[after], *self._change_of(then), dated))
@@ -399,13 +400,13 @@ class State:
         begin, end = max(d for d in known if d < day), min((d for d in known if d > day), default=day)
         return cache(partial(found_date, whole, then, day, begin, end))
 
-    def budget(self, whole: Estimate | None = None) -> Sources:
-        """What makes U of S and Q by a solution of the whole; None: it is solved anew."""
+    def budget(self, whole: Estimate | None = None, place: int = FIRST) -> Sources:
+        """What makes U of S and Q (see `result`) by a solution of the whole; None: it is solved anew."""
         whole = whole or self.estimate()
         now, by = whole.now, np.eye(12, len(whole.unknowns))
         if (under_gravity := self._under_gravity(now)) is not None:
             by[9:] -= under_gravity[1]
-        beside = self._over.budget(now, self.reference, self._priors[0], by)
+        beside = self._over.budget(now, self.reference(place), self._priors[0], by)
         return Sources.of(whole.budget(by) | beside, now.noise.degrees_of_freedom or np.inf, now.coverage_factor)
 
     def _change_of(self, then: Then) -> tuple[Array, Array]:
@@ -416,16 +417,19 @@ class State:
             moved[9:] -= under_gravity[1] @ whole
         return moved[:, 0], np.linalg.norm(moved[:, 1:], axis=1)
 
-    def quantity(self, name: str) -> tuple[float, float]:
-        """(value, u) of an unknown of the sensor, its mount or its present reference. Raises KeyError for another."""
-        now, key = self._now, self._key(name)
+    def quantity(self, name: str, place: int = FIRST) -> tuple[float, float]:
+        """(value, u) of an unknown of the sensor, its mount or the reference at a place.
+
+        Raises KeyError where it is none of these.
+        """
+        now, key = self._now, self._key(name, place)
         own = [now.index(key)]
         quantity = now.unknowns.all[own[0]].quantity
         if quantity.kind.since_certificate:  # the value at the beginning, and the walk since then
             own.append(now.index(replace(quantity, centre=True).key))
         mean, factor = now.mean, now.factor
         if quantity.kind is OFFSET_TEMPERATURE and self._varies(now):
-            mean, factor = self._values()
+            mean, factor = self._values(place)
         return float(mean[own].sum()), float(np.linalg.norm(factor[own].sum(axis=0)))
 
     @property
@@ -443,26 +447,23 @@ class State:
         """All unknowns, also those of references that are away."""
         return self._now.quantities
 
-    @property
-    def present(self) -> list[Quantity]:
-        """All unknowns of the sensor, its mount and its present reference."""
-        owners = "", self.reference, f"place {self._place}"
+    def present(self, place: int = FIRST) -> list[Quantity]:
+        """All unknowns of the sensor, its mount and the reference at a place."""
+        owners = "", self.reference(place), f"place {place}"
         return [q for q in self._now.quantities if q.owner in owners and not q.centre]
 
-    @property
-    def names(self) -> list[str]:
+    def names(self, place: int = FIRST) -> list[str]:
         """Those of `present`."""
-        return [quantity.name for quantity in self.present]
+        return [quantity.name for quantity in self.present(place)]
 
     @property
     def references(self) -> list[str]:
         """References to whose errors S and Q owe their values; the newest window's is the last."""
         return list(self._used)
 
-    @property
-    def shares(self) -> list[ReferenceShare]:
-        """What S and Q owe to the errors of each reference; that of the newest window is the last."""
-        factor = self._values()[1][:12]
+    def shares(self, place: int = FIRST) -> list[ReferenceShare]:
+        """What S and Q (see `result`) owe to the errors of each reference; that of the newest window is the last."""
+        factor = self._values(place)[1][:12]
         return [share_in(self._now, factor, r, self._met[r].sensitivity if r in self._met else 1.0) for r in self._used]
 
     @property
@@ -489,6 +490,7 @@ class State:
         standard_uncertainty: Array,
         tilt_rad: float = 0.0,
         *,
+        place: int = FIRST,
         u_rate: Array = STEADY,
         line: bool = False,
         another_filter: float = 0.0,
@@ -496,22 +498,24 @@ class State:
         """Standard uncertainties of a step, by key: of S and Q (12,), or of all `quantities` (N,), and of the tilt of a
         fixed mount.
 
-        `u_rate` (12,): S and Q may drift by as much more a day. `line`: a device or its line may have begun anew, which
-        makes the lag another. `another_filter`: the response over frequency may be another, so that S, which holds at
-        one frequency, changes by about this share of itself; inf if nobody knows by how much.
+        `u_rate` (12,): S and Q may drift by as much more a day. Of the reference at a place tell `line`: a device or
+        its line may have begun anew, which makes the lag another; and `another_filter`: the response over frequency may
+        be another, so that S, which holds at one frequency, changes by about this share of itself; inf if nobody knows
+        by how much.
         """
         u = {q.key: abs(float(s)) for q, s in zip(self.quantities, standard_uncertainty, strict=False) if s}
         u |= {ALL_RATES[p]: abs(float(u_rate[p])) for p in np.flatnonzero(u_rate).tolist()}
-        stated = self.statements.of(self.reference)
+        reference = self.reference(place)
+        stated = self.statements.of(reference)
         for quantity in self.quantities:
             of_it = () if quantity.centre else quantity.kind.loosened_by
             if "lean" in of_it and self._fixed and tilt_rad:
                 u[quantity.key] = tilt_rad
-            elif quantity.owner == self.reference and line and "line" in of_it:
+            elif quantity.owner == reference and line and "line" in of_it:
                 u[quantity.key] = stated.of(quantity.kind.prior)
-            elif quantity.owner == self.reference and another_filter and "filter" in of_it:
+            elif quantity.owner == reference and another_filter and "filter" in of_it:
                 prior = stated.of(quantity.kind.prior)
-                of_S = self._over.prior_of(self._now, self.reference, self.reference_frequency_hz, prior)
+                of_S = self._over.prior_of(self._now, reference, self.reference_frequency_hz, prior)
                 u[quantity.key] = prior * min(1.0, another_filter / of_S) if of_S else prior
         return u
 
@@ -684,68 +688,70 @@ class State:
         else:
             self._now = replace(self._now.stepped(u), day=day)
 
-    def remount(self, *, of_reference: bool) -> None:
-        """The sensor was mounted again, or the reference in use was: what a mount decides may be another from now on.
+    def remount(self, place: int | None = None) -> None:
+        """The reference at a place was mounted again, or, where none is named, the sensor: what a mount decides may be
+        another from now on.
 
         The new value is the old one and a difference: as large as that of two independent values, since it may be.
         """
-        owners = [self.reference, f"place {self._place}"] if of_reference else ["", *self._present]
-        owners += [] if of_reference else [f"place {place}" for place in range(len(self._present))]
+        every = range(len(self._present))
+        owners = [""] if place is None else []
+        owners += [owner for k in (every if place is None else [place]) for owner in (self._present[k], f"place {k}")]
         priors = {unknown.key: unknown.u for unknown in self._now.unknowns.all}
         self.step({
             q.key: float(np.sqrt(2.0)) * priors[q.key]
             for q in self.quantities
-            if q.owner in owners and not q.centre and (q.kind.of_reference or not of_reference)
+            if q.owner in owners and not q.centre and (q.kind.of_reference or place is None)
             and "remount" in q.kind.loosened_by
         })  # fmt: skip
-        if not of_reference:
+        if place is None:
             self._held_mps2 = None
             self.solve()
 
-    def date_certificate(self, day: float | None) -> None:
-        """The date of the certificate of the reference in use; its drift counts from there. None: no date is stated."""
-        stated = {name: self._priors[self._place].values[name] for name in OF_REFERENCES}
-        met = self._met.get(self.reference) or Mounted(self._place, 1.0, None, stated)
-        first = not any(record.reference == self.reference for record in self._records)
+    def date_certificate(self, day: float | None, place: int = FIRST) -> None:
+        """The date of the certificate of the reference at a place; its drift counts from there. None: no date is
+        stated."""
+        reference = self.reference(place)
+        met = self._met.get(reference) or self._mounted(place, 1.0, None)
+        first = not any(record.reference == reference for record in self._records)
         if first:  # later the day of the same date differs by the rounding of clocks alone
-            self._met[self.reference] = replace(met, certified_day=day)
+            self._met[reference] = replace(met, certified_day=day)
             self._restated()
+
+    def _mounted(self, place: int, sensitivity: float, certified_day: float | None) -> Mounted:
+        stated = {name: self._priors[place].values[name] for name in OF_REFERENCES}
+        return Mounted(place, sensitivity, certified_day, stated)
 
     def _restated(self) -> None:
         """The statements changed: the newest epoch takes them for the unknowns that come later."""
         self._now = replace(self._now, unknowns=self._now.unknowns.with_statements(self.statements))
 
-    def use(self, place: int) -> None:
-        """The next windows are of the reference at this place. Both are mounted all the time: nothing is loosened."""
-        self._place = place
-
-    def meet(self, reference: str, calibrated: str = "", sensitivity: float = 1.0) -> bool:
-        """Another reference takes the place of the one in use. What is known of that one stays, and comes back with it.
+    def meet(self, reference: str, calibrated: str = "", sensitivity: float = 1.0, place: int = FIRST) -> bool:
+        """A reference is at a place now. What is known of the one before it stays, and comes back with it.
 
         `calibrated` is the date of its certificate, "" where none is stated: a reference that was calibrated again is
         another one. `sensitivity` is that of its certificate. What the certificate states now holds for all windows of
         this reference. Returns whether that changed S or Q.
         """
         owner = self._owner(reference, calibrated)
-        before, present = self._met.get(owner), self._present[self._place]
-        stated = {name: self._priors[self._place].values[name] for name in OF_REFERENCES}
-        met = Mounted(self._place, sensitivity, None if before is None else before.certified_day, stated)
+        before, present = self._met.get(owner), self._present[place]
+        met = self._mounted(place, sensitivity, None if before is None else before.certified_day)
         if before == met and present == owner:
             return False
-        self._present[self._place], self._met[owner] = owner, met
+        self._present[place], self._met[owner] = owner, met
         if before is not None and before.sensitivity != sensitivity:
             times = before.sensitivity / sensitivity
             self._records = [r.with_reference_times(times) if r.reference == owner else r for r in self._records]
         known = any(record.reference == owner for record in self._records)
         changed = known and before is not None and before != met
         if changed:
-            was = self.result()
+            was = self.result(place)
             self.solve()
-            changed = not _same(was, self.result())
+            changed = not _same(was, self.result(place))
         else:
             self._restated()
         if present not in ("", owner):
-            self.remount(of_reference=True)
+            self.remount(place)
         return changed
 
     def _owner(self, reference: str, calibrated: str) -> str:
@@ -838,7 +844,6 @@ class State:
 
     def load(self, state: Mapping[str, Any]) -> None:
         """Go on from a snapshot. Where it was made with other statements, `restate` and `meet` must follow."""
-        self._place = 0
         self._records = [Record.load(record) for record in state["records"]]
         self._steps = [Step(**step) for step in state["steps"]]
         self._widened = [Widening(**widening) for widening in state["widened"]]

@@ -51,7 +51,7 @@ class Life:
         """A window of the present reference, without noise in the weights: they are the same whenever it is taken."""
         random = np.random.default_rng([self.seed, self.hour])
         made = building_window(random, level_mps2=(0.1, 0.1, 0.1), S=np.eye(3), Q=np.zeros(3), noise_mps2=1e-4)
-        record = Record.of(made, self.hour * HOUR, reference=self.state.reference)
+        record = Record.of(made, self.hour * HOUR, reference=self.state.reference())
         record = replace(record, scores=np.zeros_like(record.scores))
         self.state.update(record)
         priors = Priors(self._values()).at_one_frequency(self.state.reference_frequency_hz, 0.0)

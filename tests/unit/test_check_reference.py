@@ -54,9 +54,7 @@ def estimation(stability_pct: float = 0.5) -> Estimation:
 def met(found: Estimation) -> Estimation:
     """Both references are connected."""
     for place, identity in enumerate("AB"):
-        found.use(place)
-        found.meet(identity, "", 1.0)
-    found.use(FIRST)
+        found.meet(identity, "", 1.0, place)
     return found
 
 
@@ -71,10 +69,8 @@ def judged(
     """A window a day; `more` by place is what has changed."""
     random, results = np.random.default_rng(seed), []
     for k, place in enumerate(turns[:number]):
-        found.use(place)
         window = building_window(random, level_mps2=(0.1, 0.1, 0.1), **(more or {}).get(place, {}))
-        results.append(found.judge(window, float(first_day + k), 0.0, 20.0))
-        found.use(FIRST)
+        results.append(found.judge(window, float(first_day + k), 0.0, 20.0, place=place))
     return results
 
 
@@ -96,9 +92,8 @@ def adopted(results: list[Judged]) -> str:
 def test_each_reference_has_its_own_unknowns_and_priors() -> None:
     found = sound(estimation(stability_pct=0.0))
     for place, u in ((FIRST, 0.1), (SECOND, 0.2)):
-        found.use(place)
         assert {f"lag of {'AB'[place]}", f"rotation_x of place {place}"} <= {q.key for q in found.state.quantities}
-        (stated,) = [s for s in found.state.shares if s.reference == "AB"[place]]
+        (stated,) = [s for s in found.state.shares(place) if s.reference == "AB"[place]]
         assert stated.u_stated[stated.unknowns.index("reference_y")] == pytest.approx(u / 100)
     assert sorted(found.state.references) == ["A", "B"]
     with_first, with_both = (1 / np.sqrt(sum(1 / u**2 for u in us)) for us in ((0.1, 1.0), (0.1, 0.2, 1.0)))
@@ -159,10 +154,8 @@ def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() 
 def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
     found = sound(estimation())
     assert actions(judged(found, 105, 12, 3, STEPPED["first"], turns=(FIRST,) * 3)) == ["hold"] * 3
-    found.use(SECOND)
     weak = building_window(np.random.default_rng(106), level_mps2=(0.0, 0.0, 0.1))  # nothing along y
-    assert found.judge(weak, 15.0, 0.0, 20.0).decision.action == "take"
-    found.use(FIRST)
+    assert found.judge(weak, 15.0, 0.0, 20.0, place=SECOND).decision.action == "take"
     reason = adopted(judged(found, 107, 16, 2, STEPPED["first"], turns=(FIRST,) * 2))
     assert "no window with c tells" in reason
 
@@ -210,7 +203,7 @@ def u_lags(found: Estimation) -> list[float]:
 
 def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
     found = sound(estimation())
-    found.state.remount(of_reference=False)
+    found.state.remount()
     for place in (FIRST, SECOND):
         assert found.state.quantity(f"rotation_x of place {place}")[1] >= np.deg2rad(0.2)
 

@@ -56,7 +56,7 @@ def test_the_rates_are_recovered_and_q_and_s_go_on_with_them() -> None:
     assert abs(rate - RATE) < 3 * u < 0.1 * RATE
     rate, u = found.quantity("Qx_rate")
     assert abs(rate - 1e-3) < 3 * u < 5e-4
-    assert {name for name in found.names if name.endswith("_rate")} == {"Qx_rate", "Qy_rate", "Qz_rate", "Syy_rate"}
+    assert {name for name in found.names() if name.endswith("_rate")} == {"Qx_rate", "Qy_rate", "Qz_rate", "Syy_rate"}
     later = found.law(129.0)
     u = np.sqrt(later.covariance[SYY, SYY])
     assert abs(later.mean[SYY] - drifted(129.0).flat[SYY]) < 3 * u < 4e-3

@@ -125,16 +125,16 @@ def test_another_lag_after_a_line_began_anew_is_no_end_of_it() -> None:
     before = found.in_force.sensitivity
     windows = [late(building_window(random), 3.5e-3) for _ in range(8)]
     assert actions(hours(found, windows, first=10)) == ["hold"] * 4 + ["adopt"] + ["take"] * 3
-    assert abs(found.lag_s - 3.5e-3) < 2e-4
+    assert abs(found.state.lag_s() - 3.5e-3) < 2e-4
     np.testing.assert_allclose(found.in_force.sensitivity, before, rtol=0, atol=3.5e-3)
 
 
 def test_another_reference_is_late_as_its_certificate_says_until_windows_tell() -> None:
     random = np.random.default_rng(11)
     found = settled(random, certificate={"lag_s": 0.01, "u_lag_s": 0.001})
-    assert abs(found.lag_s) < 1e-4
+    assert abs(found.state.lag_s()) < 1e-4
     found.meet("B", "", 1.0)
-    assert found.lag_s == -0.01
+    assert found.state.lag_s() == -0.01
 
 
 def test_a_larger_uncertainty_is_in_force_although_rounding_moved_the_state() -> None:

@@ -53,7 +53,7 @@ def test_another_order_of_the_temperature_begins_again_with_the_kept_windows_and
     np.testing.assert_allclose(u_of(found), u_of(exact), rtol=5e-3)
     np.testing.assert_allclose(found.result().sensitivity, exact.result().sensitivity, rtol=0, atol=2e-5)
     back = restarted(found, fresh(STATED))
-    assert "Qx_T1" not in back.names
+    assert "Qx_T1" not in back.names()
     np.testing.assert_allclose(u_of(back), u_of(lived()), rtol=5e-3)
 
 
@@ -97,11 +97,11 @@ def test_a_date_stated_later_is_the_same_reference_and_another_date_is_a_new_cal
     assert dated.references == ["A, calibrated 2026-01-01"]
     np.testing.assert_allclose(u_of(dated), u_of(lived()), rtol=1e-3)
     left_out = restarted(dated, fresh(STATED))
-    assert left_out.reference == "A, calibrated 2026-01-01"
+    assert left_out.reference() == "A, calibrated 2026-01-01"
     anew = restarted(dated, fresh(STATED), calibrated="2027-01-01")
     for k in range(6):
         window = building_window(np.random.default_rng(k), level_mps2=(0.1, 0.1, 0.1))
-        anew.update(Record.of(window, 1.0 + k * HOUR, reference=anew.reference))
+        anew.update(Record.of(window, 1.0 + k * HOUR, reference=anew.reference()))
     assert anew.result().standard_uncertainty[0] == pytest.approx(3e-3 / np.sqrt(2.0), rel=0.03)
 
 

@@ -36,7 +36,7 @@ def state_of(made_with: Channel) -> bytes:
     estimation = Estimation(made_with, None)
     state = estimation.state
     in_force = calibration_update(
-        ResultSource("s", "A", "m/s2", 5), estimation.in_force, state, state.shares, lambda _: None
+        ResultSource("s", "A", "m/s2", 5), estimation.in_force, state, state.shares(), lambda _: None
     )
     return keep(DriverFilters(made_with), "", estimation, in_force, None, 0.0, 5)
 

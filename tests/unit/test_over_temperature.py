@@ -86,8 +86,8 @@ def test_a_merged_record_has_the_temperature_of_the_motion_that_tells_s() -> Non
 def test_where_no_temperature_is_told_nothing_is_another() -> None:
     untold = [float("nan")] * 4
     by_default, constant = state(BY_DEFAULT, untold), state(TemperatureModel(1, 0), untold)
-    assert by_default.names == constant.names
-    np.testing.assert_array_equal(by_default.covariance, constant.covariance)
+    assert by_default.names() == constant.names()
+    np.testing.assert_array_equal(by_default.covariance(), constant.covariance())
     np.testing.assert_array_equal(by_default.result().sensitivity, constant.result().sensitivity)
     assert by_default.reference_temperature_degc == constant.reference_temperature_degc == 20.0
 

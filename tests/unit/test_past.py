@@ -169,7 +169,7 @@ def test_the_date_of_a_found_drift_is_its_onset(every: float, last: float) -> No
 
 def test_the_date_of_a_stated_change_is_between_the_windows_before_and_after_it() -> None:
     state = filled(7)
-    state.remount(of_reference=False)
+    state.remount()
     state.update(Record.of(building_window(np.random.default_rng(8), level_mps2=(0.1, 0.1, 0.1)), 22.5))
     change = state.past().changes[-1]
     assert change.day == np.nextafter(18.5, np.inf)

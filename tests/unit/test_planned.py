@@ -85,12 +85,12 @@ def test_what_is_planned_is_what_the_agent_reaches(name: str) -> None:
     channel = configured(poses, **more).channels[0]
     plan, once, often = planned(channel, 1.0), taken(channel, 1), taken(channel, 6)
     assert plan.enough == (often.gate.status == "VALID")
-    first = np.sqrt(np.diag(Estimation(channel, 1.0).state.covariance))
-    last = np.sqrt(np.diag(often.state.covariance))
+    first = np.sqrt(np.diag(Estimation(channel, 1.0).state.covariance()))
+    last = np.sqrt(np.diag(often.state.covariance()))
     reached = (last < 0.5 * first) | (2.0 * first <= MAX_CHANGE)  # as docs/vocabulary.md and docs/online.md say
     clear = np.abs(last / first - 0.5) > 0.1
     np.testing.assert_array_equal(plan.determined[clear], reached[clear])
-    u = np.sqrt(np.diag(once.state.covariance))
+    u = np.sqrt(np.diag(once.state.covariance()))
     measured = np.append(2.0 * u[:9].reshape(3, 3) / np.diag(S_TRUE)[:, None], 2.0 * u[9:])
     worst = [measured[k].max() for k in ([0, 4, 8], [1, 2, 3, 5, 6, 7], [9, 10, 11])]
     told = [plan.expanded[k].max() for k in ([0, 4, 8], [1, 2, 3, 5, 6, 7], [9, 10, 11])]

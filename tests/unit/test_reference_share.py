@@ -51,7 +51,7 @@ def parameters(found: State) -> np.ndarray:
 def test_a_corrected_state_is_that_of_the_same_data_with_the_other_certificate(step: float, u: float) -> None:
     found = child(np.random.default_rng(1), 0.0, windows=3, drift=2e-3)
     expected = child(np.random.default_rng(1), 1.0 / (1.0 + step) - 1.0, u=u, windows=3, drift=2e-3)
-    (share,) = found.shares
+    (share,) = found.shares()
     is_constant = np.array([not name.startswith("reference_drift") for name in share.unknowns])
     assert (share.reference, is_constant.sum(), (~is_constant).sum()) == ("A", 3, 3)
     stated, u_stated = (
@@ -72,7 +72,7 @@ def test_the_difference_of_two_children_of_one_reference_has_the_u_that_is_state
     for _ in range(REFERENCES):
         error = random.normal(0.0, U_REFERENCE, 3)
         one, other = (child(random, error) for _ in range(2))
-        cross = np.diag(shared_covariance(one.shares, other.shares))[[0, 4, 8]]
+        cross = np.diag(shared_covariance(one.shares(), other.shares()))[[0, 4, 8]]
         off = (parameters(one) - parameters(other))[[0, 4, 8]]
         both = (one.result().standard_uncertainty ** 2 + other.result().standard_uncertainty ** 2)[[0, 4, 8]]
         parts["shared"] += (off / np.sqrt(both - 2.0 * cross)).tolist()

@@ -96,7 +96,7 @@ def test_on_line_they_stay_with_their_reference(swapped: bool) -> None:
             state.meet(reference)
             across = shows[reference]
             made = building_window(random, level_mps2=(0.5, 0.5, 0.5), S=S @ np.linalg.inv(np.eye(3) + across))
-            state.update(replace(Record.of(made, hour / 24.0, reference=state.reference)))
+            state.update(replace(Record.of(made, hour / 24.0, reference=state.reference())))
         found = state.result()
         error = found.sensitivity - S
         square.append(((error / found.standard_uncertainty[:9].reshape(3, 3)) ** 2)[TRANSVERSE])

@@ -122,7 +122,7 @@ def of_year(*, fixed: bool) -> State:
         window = building_window(random, level_mps2=level, reference_noise_mps2=1e-3)
         noisy = replace(window, reference_noise=np.array([[1e-3] * 3, [0.0] * 3]))
         state.meet("A" if k < 18 else "B")
-        state.update(Record.of(noisy, 0.2 * k, 0.0, np.nan if k % 7 == 0 else 20.0 + k % 5, state.reference))
+        state.update(Record.of(noisy, 0.2 * k, 0.0, np.nan if k % 7 == 0 else 20.0 + k % 5, state.reference()))
     return state
 
 

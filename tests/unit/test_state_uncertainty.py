@@ -50,7 +50,7 @@ def test_what_was_mounted_again_differs_as_two_independent_values_do() -> None:
     found.update(record())
     names = ("rotation_x", "gravity_x[p]", "gravity")
     before = [found.quantity(name)[1] for name in names]
-    found.remount(of_reference=False)
+    found.remount()
     after = [found.quantity(name)[1] for name in names]
     grown = np.sqrt(np.square(after) - np.square(before))
     np.testing.assert_allclose(grown, np.sqrt(2.0) * np.array([0.003, 0.002, 0.0]), rtol=1e-6, atol=1e-9)

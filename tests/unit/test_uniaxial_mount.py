@@ -145,5 +145,5 @@ def test_of_positions_left_long_ago_nothing_is_kept(monkeypatch: pytest.MonkeyPa
         one = window(random, replace(stated, position=f"p{k}"), stated.direction[:, 0], GRAVITY)
         found.update(Record.of(one, float(k)))
     assert {quantity.position for quantity in found.quantities} == {"", "p1", "p2", "p3", "p4"}  # p4 came after the day
-    assert "transverse_a[p4]_quadrature" in found.names
-    assert [name for name in found.names if "p0" in name] == []
+    assert "transverse_a[p4]_quadrature" in found.names()
+    assert [name for name in found.names() if "p0" in name] == []

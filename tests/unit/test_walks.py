@@ -152,12 +152,12 @@ def test_a_widened_walk_adds_its_variance_in_proportion_to_the_time() -> None:
     priors = Priors(dict(Priors.none().values) | {"offset_mps2": 0.01})
     found = State(mean, u, priors, Wander.none(), TemperatureModel(), fixed=False)
     found.update(Record.of(building_window(np.random.default_rng(1), level_mps2=(0.1, 0.1, 0.1)), 0.0))
-    before = found.covariance[SYY, SYY]
+    before = found.covariance()[SYY, SYY]
     found.widen([Widening(-5.0, 15.0, {"Syy": 0.02})])
     found.solve()
     for day, share in ((5.0, 0.25), (15.0, 0.75), (40.0, 0.75)):
         assert found.law(day).covariance[SYY, SYY] - before == pytest.approx(share * 0.02**2, rel=1e-6)
-    assert found.law(40.0).covariance[SXY, SXY] == pytest.approx(found.covariance[SXY, SXY], rel=1e-9)
+    assert found.law(40.0).covariance[SXY, SXY] == pytest.approx(found.covariance()[SXY, SXY], rel=1e-9)
 
 
 def life_of(rate_pct: float, days: int) -> Life:
