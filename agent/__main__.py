@@ -6,7 +6,7 @@ import os
 import sys
 
 from agent.cli.stopping import end_at_once_by_signals
-from agent.delivery.ending import ProcessEnd
+from agent.delivery.ending import ProcessEnd, raise_every_interrupt
 
 EXIT_S = 10.0  # s for what a command leaves behind: exit handlers, and threads that wait for Zenoh or a device
 
@@ -15,6 +15,8 @@ def main() -> None:
     """Run the command line; see `fieldcal --help`."""
     if sys.argv[1:2] == ["run"]:
         end_at_once_by_signals()
+    elif sys.platform != "win32":
+        raise_every_interrupt()
     ending = ProcessEnd()
     # scipy carries its own OpenBLAS beside numpy's; both read this when they load, and sums over another number of
     # threads differ in the last bit.

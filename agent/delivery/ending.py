@@ -15,8 +15,11 @@ import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
+
+WAKES, WAKE_S = 300, 0.1  # how often, and after how many s each, a call that waits is interrupted after SIGINT
 
 
 class ProcessEnd:
@@ -42,6 +45,36 @@ class ProcessEnd:
             except (OSError, ValueError):  # nobody reads it, the disk is full, or it is closed
                 self.status = self.status or 1
         os._exit(self.status)
+
+
+def raise_every_interrupt() -> None:
+    """From now on each SIGINT that this process handles by KeyboardInterrupt raises it. In the main thread.
+
+    Python raises it before the next instruction of the main thread. Where the signal comes just before a system call
+    that waits, there is none. Python also discards it in callbacks of its import system and in finalisers. So a thread,
+    which the interpreter tells of each signal at once, interrupts such a call, and raises anew what was discarded.
+    """
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    main, tell = threading.get_ident(), sys.unraisablehook
+    discarded: list[signal.Signals] = []
+
+    def watch() -> None:
+        while number := os.read(reading, 1):
+            for _ in range(WAKES if number[0] == signal.SIGINT else 0):
+                time.sleep(WAKE_S)
+                signal.pthread_kill(main, discarded.pop() if discarded else signal.SIGURG)
+
+    def unraisable(told: sys.UnraisableHookArgs) -> None:
+        if issubclass(told.exc_type, KeyboardInterrupt):
+            discarded.append(signal.SIGINT)
+        else:
+            tell(told)
+
+    signal.signal(signal.SIGURG, lambda *_: None)  # a signal without a handler interrupts no call
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    sys.unraisablehook = unraisable
+    threading.Thread(target=watch, name="interrupts", daemon=True).start()
 
 
 class StopRequest:

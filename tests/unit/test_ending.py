@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -106,6 +107,52 @@ for number in (signal.SIGINT, signal.SIGTERM):
     print(before, stop.is_set())
 """)
     assert (told.returncode, told.stdout, told.stderr) == (0, "False True\nFalse True\n", "")
+
+
+@pytest.mark.parametrize("raises", ["raise_every_interrupt()", ""])
+def test_an_interrupt_reaches_a_call_that_waits_already(tmp_path: Path, raises: str) -> None:
+    """A signal just before the call; here another thread takes it while the main thread waits, which is the same."""
+    told = ended(f"""
+import os, signal, threading, time
+from pathlib import Path
+from agent.delivery.ending import raise_every_interrupt
+{raises}
+def waits(begun=threading.main_thread().native_id):
+    return Path(f"/proc/self/task/{{begun}}/wchan").read_text() == "wait_for_partner"
+def signals():
+    while not waits():
+        time.sleep(0.01)
+    signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+    time.sleep(2.0)
+    os._exit(3)  # the main thread still waits
+os.mkfifo("{tmp_path}/pipe")
+threading.Thread(target=signals, daemon=True).start()
+try:
+    open("{tmp_path}/pipe", "w")  # until somebody reads
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+    os._exit(0)
+""")
+    assert (told.returncode, told.stdout, told.stderr) == ((0, "interrupted\n", "") if raises else (3, "", ""))
+
+
+@pytest.mark.parametrize("raises", ["raise_every_interrupt()", ""])
+def test_an_interrupt_that_a_finaliser_discards_is_raised_anew(raises: str) -> None:
+    told = ended(f"""
+import signal, sys, time
+from agent.delivery.ending import raise_every_interrupt
+{raises}
+class Finalised:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+try:
+    Finalised()
+    time.sleep(2.0)
+except KeyboardInterrupt:
+    print("interrupted")
+""")
+    assert (told.returncode, told.stdout) == (0, "interrupted\n" if raises else "")
+    assert ("KeyboardInterrupt" in told.stderr) == (not raises)
 
 
 def test_output_that_cannot_be_written_is_no_success() -> None:

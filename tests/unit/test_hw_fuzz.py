@@ -1,4 +1,4 @@
-"""Short form of benchmarks/fuzz_drivers: 10^4 random and mutated streams, divided among all parsers."""
+"""Short form of benchmarks/fuzz_drivers: random and mutated streams, divided among all parsers."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from benchmarks.fuzz_drivers import fuzz, parsers
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1])
-def test_no_exception_and_no_growth(seed: int) -> None:
-    rows = fuzz(10_000 // len(parsers()), seed)
+def test_no_exception() -> None:
+    assert sum(row.streams for row in fuzz(1_000 // len(parsers()), seed=1)) >= 1_000 - len(parsers())
+
+
+@pytest.mark.thorough
+def test_no_exception_and_no_growth() -> None:
+    rows = fuzz(10_000 // len(parsers()), seed=1)
     assert sum(row.streams for row in rows) >= 9_990
     # A parser may keep unfinished lines or frames, and examples. If it kept a burst of 200 bytes per stream, memory
     # would grow by more than 100 kB; 41 kB were seen.
