@@ -60,16 +60,16 @@ def test_the_stated_uncertainty_is_the_scatter_of_hours() -> None:
 
 
 def test_a_floor_that_doubles_moves_nothing() -> None:
-    """White noise of a quarter of the motion, and twice its power: the same hour within 0.1 %, and within its u."""
+    """White noise of 1.5 times the motion, and twice its power: four hours within 0.3 %, each within 3 u."""
     bands = bands_of(RATE_HZ)
     near = np.flatnonzero(np.abs(np.log10(bands.centre_hz / 2.3)) < 0.07)
     shift, both = [], []
     for seed in range(4):
-        (quiet, u), (loud, u_loud) = (beside(2.3, (noise,) * 3, seed) for noise in (0.25, 0.25 * 2.0**0.5))
+        (quiet, u), (loud, u_loud) = (beside(2.3, (noise,) * 3, seed) for noise in (1.5, 1.5 * 2.0**0.5))
         shift.append((loud / quiet - 1.0)[:, near])
         both.append(np.hypot(u, u_loud)[:, near] / 2.3)
     assert len(near) == 2
-    assert np.abs(np.mean(shift, axis=0)).max() < 1e-3
+    assert np.abs(np.mean(shift, axis=0)).max() < 3e-3
     assert (np.abs(shift) < 3.0 * np.array(both)).all()
 
 

@@ -86,6 +86,18 @@ def test_what_one_sensor_sees_alone_is_not_the_structure() -> None:
     assert not after(20, in_window(2, 0.05, slice(0, 2))).frequencies
 
 
+@pytest.mark.parametrize("see", [2, 3])
+def test_a_frequency_that_fewer_than_three_sensors_see_is_not_told(see: int) -> None:
+    site, watch = Frequencies(8), SiteWatch(GATEWAY, BANDS_HZ)
+    for k in range(60):
+        hours, _ = site.day(in_window(2, 0.03) if k >= 50 else 0.0)
+        assert hours.frequency is not None
+        peak = hours.frequency.copy()
+        peak[:, see:, 2] = np.nan
+        watch.update(day_of(replace(hours, frequency=peak), BANDS_HZ))
+    assert len(result(watch).frequencies) == (see >= 3)
+
+
 def test_sensors_that_see_another_mode_in_the_window_do_not_hide_the_change() -> None:
     """Of six, four see a mode that falls by 2 %, and two another one 9 % below it that stays."""
     site, watch = Frequencies(7), SiteWatch(GATEWAY, BANDS_HZ)
