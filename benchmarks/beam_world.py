@@ -11,12 +11,17 @@ times the response of an oscillator, with frequencies that move with the tempera
 from an hour does (complex Wishart, 2 B T degrees of freedom). So modes beat in each sensor otherwise, and a band
 with two modes has shapes that depend on the loads. Wind has a level for each hour, day and season; traffic has rush
 hours and weekends.
+
+Frequencies fall with the temperature of the structure, which follows that of the air within half a day, and rise more
+where it freezes. The mass of the traffic lowers them, and something that nobody measures moves each by 0.1 % within
+three days. The peak frequency of a window is that of the squared spectrum of all modes in it, and of what an
+uncertain floor leaves of the noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from calib.model import Array
+from calib.signal.spectra import LEAST_RATIO, THIRD_OCTAVE
 from calib.site_watch.day import Hours
 
 BANDS_HZ = 10.0 ** (np.arange(0, 14) / 10.0)  # 1 Hz to 20 Hz
@@ -36,6 +42,11 @@ TEMPERATURE_DEGC = 10.0
 SPAN_K = 20.0  # half of the range of a year
 PER_DAY = 24
 ACTING = 5  # modes that move a band
+UNSEEN_H, LAG_H = 72.0, 12.0  # time constants: of what moves frequencies unseen, and of the structure's temperature
+FREEZING = 3.0  # times as much as above do frequencies move below 0 °C
+U_TOLD_NOISE = 0.05
+GRID = 1.0 / 115.0  # third octaves, from point to point of a spectrum: 0.2 %
+LINE_HZ = 0.012  # half the width of a line of a minute under Hann's window
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,9 @@ class World:
     """What is stated of the world.
 
     `scatter` of the log amplitude of a sensor in an hour, all bands together, correlated over `scatter_h`;
-    `shape_per_k`: how far shapes move; `noise`: of the power of the weakest third of the bands.
+    `shape_per_k`: how far shapes move; `noise`: of the power of the weakest third of the bands. `frequency_moves`: by
+    temperature within a year; `frequency_scatter` of each mode, correlated over UNSEEN_H; `traffic_mass`: by how much
+    the traffic of a rush hour lowers frequencies.
     """
 
     scatter: float = 0.0032
@@ -51,6 +64,8 @@ class World:
     shape_per_k: float = 2e-4
     noise: float = 0.1
     frequency_moves: float = 0.02
+    frequency_scatter: float = 0.001
+    traffic_mass: float = 0.001
 
 
 @dataclass
@@ -97,6 +112,8 @@ class Bridge:
         self._table()
         self._noise()
         self.state = random.normal(size=(n, len(BANDS_HZ), 3))
+        self.own = np.random.default_rng([self.seed, 1])  # of the frequencies alone
+        self.unseen, self.warmth = self.own.normal(size=m), TEMPERATURE_DEGC
 
     def _shapes(self, place: Array, side: Array) -> Array:
         """(sensors, 3, modes): bending has a small part in the other directions, torsion moves y and z."""
@@ -125,6 +142,11 @@ class Bridge:
                 response = f**4 / ((own**2 - f**2) ** 2 + (2.0 * zeta * own * f) ** 2)
                 self.log_power[m, b] = np.log(np.trapezoid(response, f, axis=0))
         self.width_hz = np.diff(edge)
+        # Frequencies of the spectra in which peaks are sought; of each window its weight, and that times its place.
+        self.grid_hz = BANDS_HZ[0] * 10.0 ** (0.1 * np.arange(-1.0, len(BANDS_HZ), GRID))
+        place = 10.0 * np.log10(self.grid_hz[:, None] / BANDS_HZ)
+        weight = np.maximum(1.0 - np.abs(place), 0.0) * (GRID * self.grid_hz * THIRD_OCTAVE)[:, None]
+        self.windows = np.hstack([weight, weight * place]).astype(np.float32)
         self.strongest = np.argsort(-self.log_power[:, :, 32], axis=0)[:ACTING].T
 
     def _noise(self) -> None:
@@ -166,7 +188,8 @@ class Bridge:
         cross = np.empty_like(power)
         away = (degc[:PER_DAY] - TEMPERATURE_DEGC) / SPAN_K
         shapes = self._moved_shapes(float(away.mean()), day)
-        root = self._modal_root(away, wind, traffic, day)  # (24, gateways, bands, modes)
+        load, moved = self._loads(wind, traffic), self._moved(degc, traffic, day)
+        root = self._modal_root(load, moved)  # (24, gateways, bands, modes)
         scatter = self._scatter()
         for b, modes in enumerate(self.strongest):
             # (24, n, 3, modes) of the realised motion: each mode's part, mixed by the scatter of an hour's spectra
@@ -182,11 +205,12 @@ class Bridge:
         cross += between * random.standard_normal(cross.shape, dtype=np.float32)
         relative = np.sqrt((floor**2 + 2.0 * power * floor) / freedom)
         power += floor + relative * random.standard_normal(power.shape, dtype=np.float32)
-        told = self.noise[None] * np.exp(0.05 * random.standard_normal((PER_DAY, n, 3)))
+        told = self.noise[None] * np.exp(U_TOLD_NOISE * random.standard_normal((PER_DAY, n, 3)))
         hours = self.hour + np.arange(PER_DAY)
         self.hour += PER_DAY
         inside = degc[:PER_DAY, None] + 0.3 * random.standard_normal((PER_DAY, n))
-        return Hours(hours, power, cross, told, inside)  # type: ignore[arg-type] # whole numbers, and half the memory
+        frequency = self._frequency(shapes, load, moved, told - self.noise)
+        return Hours(hours, power, cross, told, inside, None, frequency)  # type: ignore[arg-type] # whole numbers, and half the memory
 
     def _realised(self, b: int, modes: Array) -> Array:
         """(24, modes, modes): the estimate of an identity from an hour; real part of a complex Wishart matrix."""
@@ -197,22 +221,62 @@ class Bridge:
         symmetric = (raw + raw.transpose(0, 2, 1)) / np.sqrt(2.0)  # variance 1 off the diagonal, 2 on it
         return np.eye(len(modes)) + symmetric / np.sqrt(2.0 * freedom)
 
-    def _modal_root(self, away: Array, wind: Array, traffic: Array, day: int) -> Array:
-        """Root of each mode's acceleration power in each band, as the clock of each gateway cuts the hours."""
+    def _loads(self, wind: Array, traffic: Array) -> Array:
+        """(24, gateways, modes), as the clock of each gateway cuts the hours."""
         at = np.arange(PER_DAY)[:, None] + 0.5 + self.clock_h
         hours = np.arange(PER_DAY + 1.0)
-        load = (self.wind * np.exp(2.0 * np.interp(at, hours, wind))[..., None]
-                + self.traffic * np.exp(2.0 * np.interp(at, hours, traffic))[..., None])  # fmt: skip
-        moved = -self.moves * away[:, None]  # (24, modes)
+        return np.asarray(self.wind * np.exp(2.0 * np.interp(at, hours, wind))[..., None]
+                          + self.traffic * np.exp(2.0 * np.interp(at, hours, traffic))[..., None])  # fmt: skip
+
+    def _moved(self, degc: Array, traffic: Array, day: int) -> Array:
+        """(24, modes): by how much each frequency is higher in each hour than at TEMPERATURE_DEGC."""
+        keep, still = np.exp(-1.0 / UNSEEN_H), np.exp(-1.0 / LAG_H)
+        moved = np.empty((PER_DAY, len(FREQUENCY_HZ)))
+        for h in range(PER_DAY):
+            self.warmth = still * self.warmth + (1.0 - still) * float(degc[h])
+            self.unseen = keep * self.unseen + np.sqrt(1.0 - keep**2) * self.own.normal(size=moved.shape[1])
+            frozen = (FREEZING - 1.0) * max(-self.warmth, 0.0)
+            moved[h] = -self.moves * (self.warmth - TEMPERATURE_DEGC - frozen) / SPAN_K
+            moved[h] += self.world.frequency_scatter * self.unseen - self.world.traffic_mass * np.exp(traffic[h] - 0.8)
         if self.damage is not None and day >= self.damage.day:
             moved[:, self.damage.mode] -= self.damage.frequency
-        place = (moved - self.at[0]) / (self.at[1] - self.at[0])
+        return moved
+
+    def _at(self, table: Array, moved: Array) -> Array:
+        """A table (modes, bands, at) in each hour: (24, modes, bands)."""
+        place = np.clip((moved - self.at[0]) / (self.at[1] - self.at[0]), 0.0, len(self.at) - 1.001)
         low = np.floor(place).astype(int)
         part = (place - low)[..., None]
         k = np.arange(moved.shape[1])
-        log_power = (1.0 - part) * self.log_power[k, :, low] + part * self.log_power[k, :, low + 1]
-        root = np.sqrt(load)[..., None] * np.exp(0.5 * log_power)[:, None]  # (24, gateways, modes, bands)
-        return root.transpose(0, 1, 3, 2)
+        return np.asarray((1.0 - part) * table[k, :, low] + part * table[k, :, low + 1])
+
+    def _modal_root(self, load: Array, moved: Array) -> Array:
+        """Root of each mode's acceleration power in each band: (24, gateways, bands, modes)."""
+        root = np.sqrt(load)[..., None] * np.exp(0.5 * self._at(self.log_power, moved))[:, None]
+        return np.asarray(root.transpose(0, 1, 3, 2))
+
+    def _frequency(self, shapes: Array, load: Array, moved: Array, floor_error: Array) -> Array:
+        """Peak frequency of each window (24, n, bands, 3), as the log of it over the centre; NaN where the noise is too
+        strong. All sensors see the same hour of a mode, so what its frequency scatters by is common to them."""
+        n, bands, random = self.sensors, len(BANDS_HZ), self.own
+        found = np.full((PER_DAY, n, 3, bands), np.nan)
+        wide = np.hypot(DAMPING, LINE_HZ / FREQUENCY_HZ)  # as segments of a minute show it
+        by_chance = np.sqrt(5.0 * DAMPING / (4.0 * np.pi * FREQUENCY_HZ * 3600.0))
+        square = np.square(self.grid_hz)
+        for h in range(PER_DAY):
+            own = (FREQUENCY_HZ * (1.0 + moved[h] + by_chance * random.standard_normal(len(wide))))[:, None]
+            response = square**2 / ((own**2 - square) ** 2 + np.square(2.0 * wide[:, None] * own * self.grid_hz))
+            power = shapes**2 * load[h, self.gateway, None]  # (n, 3, modes)
+            psd = (power.reshape(3 * n, -1) @ response).astype(np.float32)
+            first = (psd @ self.windows).reshape(n, 3, 2, bands)
+            squared = (np.square(psd) @ self.windows).reshape(n, 3, 2, bands)
+            noise = self.noise[..., None]
+            scatter = np.square(noise) * np.sqrt(5.0 * self.width_hz / 3600.0)
+            left = squared - 2.0 * floor_error[h, :, :, None, None] * first
+            left = left + scatter[:, :, None] * np.array([[1.0], [0.4]]) * random.standard_normal(left.shape)
+            counts = left[:, :, 0] > LEAST_RATIO * 2.0 * noise * first[:, :, 0]
+            found[h] = THIRD_OCTAVE * np.where(counts, left[:, :, 1] / np.where(counts, left[:, :, 0], 1.0), np.nan)
+        return found.transpose(0, 1, 3, 2)
 
     def _moved_shapes(self, away: float, day: int) -> Array:
         size = self.world.shape_per_k * SPAN_K
@@ -245,7 +309,7 @@ def changed(
         power[first:, i] *= scale**2
         cross[first:, i] *= scale[[0, 0, 1]] * scale[[1, 2, 2]]
         noise[first:, i] *= scale**2
-    return Hours(hours.hour, power, cross, noise, hours.temperature_degc)
+    return replace(hours, power=power, cross=cross, noise_psd=noise)
 
 
 def turned(hours: Hours, sensor: int, axis: int, angle_rad: float) -> Hours:
@@ -263,4 +327,4 @@ def turned(hours: Hours, sensor: int, axis: int, angle_rad: float) -> Hours:
     M = R @ M @ R.T
     power[:, sensor] = M[..., [0, 1, 2], [0, 1, 2]] + noise
     cross[:, sensor] = M[..., [0, 0, 1], [1, 2, 2]]
-    return Hours(hours.hour, power, cross, hours.noise_psd, hours.temperature_degc)
+    return replace(hours, power=power, cross=cross)

@@ -28,6 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -148,7 +149,7 @@ def noisier(hours: Hours, i: int, bridge: Bridge, random: np.random.Generator) -
     scatter = np.sqrt((more**2 + 2.0 * power[:, i] * more) / freedom)
     power[:, i] += more + scatter * random.standard_normal(power[:, i].shape)
     noise[:, i] *= 2.0
-    return Hours(hours.hour, power, hours.cross, noise, hours.temperature_degc)
+    return replace(hours, power=power, noise_psd=noise)
 
 
 def damage(bridge: Bridge, watch: SiteWatch, cases: int, count: Counter[str]) -> None:
@@ -171,9 +172,20 @@ def damage(bridge: Bridge, watch: SiteWatch, cases: int, count: Counter[str]) ->
                 one.site.kind == "structure" or any(t.kind == "sensor or structure" for t in one.sensors)
                 for one in found
             )
+            if name == "frequency":
+                _of_frequency(found, FREQUENCY_HZ[what.mode], what.frequency, begin, count)
             count[f"{name} as sensitivity"] += any(
                 bool(one.gateways) or any(told.kind == "sensitivity" for told in one.sensors) for one in found
             )
+
+
+def _of_frequency(found: list[SiteVerdicts], hz: float, fallen: float, begin: int, count: Counter[str]) -> None:
+    """Is the frequency named, with its size and date, on the last day?"""
+    for told in found[-1].frequencies[:1]:
+        if abs(told.hz / hz - 1.0) < 0.06:
+            count["frequency near"] += 1
+            count["frequency covered"] += bool(abs(told.size - np.log1p(-fallen)) <= told.U)
+            count["frequency dated"] += told.earliest <= begin <= told.latest
 
 
 def sound(seed: int, sensors: int, count: Counter[str]) -> None:
@@ -188,12 +200,16 @@ def sound(seed: int, sensors: int, count: Counter[str]) -> None:
         found = result(watch)
         told = {("sensor", i): one.kind for i, one in enumerate(found.sensors)}
         told |= {("gateway", g): one.kind for g, one in found.gateways.items()}
+        told["site", 0] = "frequency" if found.frequencies else "none"
         for who, kind in told.items():
             if kind in ("none", "learning"):
                 continue
-            group = {"noise": "noise", "structure": "structure", "sensor or structure": "structure"}.get(
-                kind, "sensitivity"
-            )
+            group = {
+                "noise": "noise",
+                "frequency": "frequency",
+                "structure": "structure",
+                "sensor or structure": "structure",
+            }.get(kind, "sensitivity")
             count[f"false {group}"] += number - last.get((who, group), -99) > 28
             last[who, group] = number
     count["days"] += SITE_DAYS - FIRST_LOOK
@@ -244,11 +260,15 @@ def table(sensors: int, cases: int, end: float) -> str:
         ("a noise floor doubles, 14 days: told as noise", "noise told", "noise as sensitivity"),
         ("a shape changes by 5 % at three sensors, 14 days: told as structure", "shape told", "shape as sensitivity"),
         ("a frequency falls by 2 %, 14 days: told as structure", "frequency told", "frequency as sensitivity"),
+        ("the same: the frequency named, within 6 %", "frequency near", ""),
     ):
         of = count[f"{told.split()[0]} cases"]
         lines.append(f"| {name} | {wilson(count[told], of)} | {of} |")
         if wrong:
             lines.append(f"| the same: told as a sensitivity | {wilson(count[wrong], of)} | {of} |")
+    of = count["frequency near"]
+    lines.append(f"| of these: size within U | {wilson(count['frequency covered'], of)} | {of} |")
+    lines.append(f"| of these: date within what is told | {wilson(count['frequency dated'], of)} | {of} |")
     return "\n".join(lines)
 
 
@@ -263,7 +283,8 @@ def sound_table(sensors: int, years: float, end: float) -> str:
         print(f"sound site {seed + 1} of {sites}", dict(count), flush=True)
     passed = count["days"] / 365.25
     lines = ["| false alarms of sound sites | for each site and year | years |", "| --- | --- | --- |"]
-    for kind, name in (("sensitivity", "sensitivity, turn or gateway"), ("structure", "structure"), ("noise", "noise")):
+    for kind, name in (("sensitivity", "sensitivity, turn or gateway"), ("structure", "structure, by shapes"),
+                       ("frequency", "structure, by a frequency"), ("noise", "noise")):  # fmt: skip
         lines.append(f"| {name} | {poisson(count[f'false {kind}'], passed)} | {passed:.1f} |")
     return "\n".join(lines)
 
@@ -443,6 +464,8 @@ def _kept(sensors: int, engine: Sqlite) -> str:
 
 def _received(hours: Hours, bridge: Bridge) -> Iterable[Received]:
     """The results of a day as the bus brings them."""
+    assert hours.frequency is not None
+    hz = BANDS_HZ[:, None] * np.exp(hours.frequency)
     for h, hour in enumerate(hours.hour.tolist()):
         for i in range(bridge.sensors):
             fields = {
@@ -452,6 +475,7 @@ def _received(hours: Hours, bridge: Bridge) -> Iterable[Received]:
                 "noise_psd": hours.noise_psd[h, i].tolist(), "mean_mps2": [0.1, 0.2, 9.8], "u_main_pct": [0.2] * 3,
                 "band_power": hours.power[h, i].T.ravel().tolist(), "calibration_run_id": "0" * 32,
                 "cross_power": hours.cross[h, i].T.ravel().tolist(), "calibration_sequence": 1,
+                "peak_frequency_hz": [f if f > 0.0 else None for f in hz[h, i].T.ravel().tolist()],
             }  # fmt: skip
             address = Address("bridge", f"g{bridge.gateway[i]}", f"s{i}", "watch")
             yield Received("", address, fields["sequence"], fields, None)

@@ -367,8 +367,10 @@ class WatchReport(Result, frozen=True, kw_only=True):
     `segments` of about a minute without such a block tell the rest. Their means give `mean_mps2`, and `mean_scatter`
     is the standard deviation of these means over the root of their number. `noise_psd` (3,) in (m/s2)2/Hz,
     `band_power` x, y, z and `cross_power` xy, xz, yz in (m/s2)2, one after the other, for each of the third octaves
-    `band_hz` (calib.signal.spectra). `u_main_pct` (3,): standard uncertainty of the main sensitivities in force at the
-    end of the hour. `gravity`: what the mean says beside that at the time of the calibration; "" while it says nothing.
+    `band_hz` (calib.signal.spectra). `peak_frequency_hz` x, y, z: where the squared PSD lies in a window around each of
+    them (calib.signal.spectra.peak_frequency), and its standard uncertainty; empty in results of earlier versions.
+    `u_main_pct` (3,): standard uncertainty of the main sensitivities in force at the end of the hour. `gravity`: what
+    the mean says beside that at the time of the calibration; "" while it says nothing.
     """
 
     what: ClassVar[str] = "watch"
@@ -393,6 +395,8 @@ class WatchReport(Result, frozen=True, kw_only=True):
     calibration_sequence: int
     u_main_pct: list[float]
     gravity: str = ""
+    peak_frequency_hz: list[float] = []
+    u_peak_frequency_hz: list[float] = []
 
 
 class SelfTestReport(Result, frozen=True, kw_only=True):

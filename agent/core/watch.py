@@ -7,7 +7,7 @@ the calibration that is in force then. So an hour never mixes two calibrations.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from agent.core.stream import SATURATED, UNCOUNTED
 from calib.estimate.correction import Law
 from calib.model import Array
-from calib.signal.spectra import Bands, Segment, bands_of, noise_floor, robust_power, segment_of, turned
+from calib.signal.spectra import Bands, Segment, bands_of, noise_floor, peak_frequency, robust_power, segment_of, turned
 from hw.block import SampleBlock
 
 HOUR_NS = 3_600_000_000_000
 BACK_NS = HOUR_NS // 2  # UTC that steps back by less stays in the hour that is open
 FILLED = 0.01  # of a segment: so many missing samples are bridged by straight lines; more begin another segment
 COUNTS = ("samples", "stuck", "clipped", "missing")
+PARTS = ("mean", "power", "floor", "peaks")  # of a segment
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +40,8 @@ class Hour:
     noise_psd: Array
     centre_hz: Array
     power: Array  # (6, B) as spectra.PAIRS
+    frequency_hz: Array  # (3, B) peak frequency of each window
+    u_frequency_hz: Array
 
 
 class SensorWatch:
@@ -87,7 +90,7 @@ class SensorWatch:
         elif (lost := block.first_index - before) > 0:
             self._counts["missing"] += lost
             x = self._bridged(x, lost, bands)
-        self._take(x, degc, not (suspect.any() or flags & SATURATED), bands)
+        self._take(x, degc, not (suspect.any() or flags & SATURATED), bands, law)
         self._next = block.first_index + block.n
         return done
 
@@ -115,7 +118,7 @@ class SensorWatch:
         between = np.arange(1, lost + 1)[:, None] / (lost + 1.0)
         return np.vstack([last + between * (x[0] - last), x])
 
-    def _take(self, x: Array, degc: float | None, sound: bool, bands: Bands) -> None:
+    def _take(self, x: Array, degc: float | None, sound: bool, bands: Bands, law: Law) -> None:
         """Fill segments with these samples."""
         while len(x):
             if not self._length:
@@ -127,14 +130,17 @@ class SensorWatch:
             if degc is not None:
                 self._degrees += len(part) * np.array([1.0, degc])
             if self._length == bands.samples:
-                self._end_segment(bands)
+                self._end_segment(bands, law)
 
-    def _end_segment(self, bands: Bands) -> None:
+    def _end_segment(self, bands: Bands, law: Law) -> None:
         if self._sound:
-            made = segment_of(self._held, bands)
             told, total = self._degrees.tolist()
-            whole = Segment(made.mean + self._zero, made.power, made.floor)
-            self._segments.append((total / told if told else float("nan"), whole))
+            degc = total / told if told else float("nan")
+            try:
+                made = segment_of(self._held, bands, _inverse(law.at(degc).sensitivity))
+            except np.linalg.LinAlgError:
+                made = segment_of(self._held, bands, np.full((3, 3), np.nan))
+            self._segments.append((degc, replace(made, mean=made.mean + self._zero)))
         self._begin_segment(bands.samples)
 
     def _close(self, law: Law) -> Hour | None:
@@ -154,6 +160,7 @@ class SensorWatch:
             return None
         unknown = np.full(3, np.nan)
         mean, scatter, noise, power = unknown, unknown, unknown, np.full((6, len(bands.centre_hz)), np.nan)
+        frequency = power[:3], power[:3]
         if n:
             own = [segment for _, segment in segments]
             means = np.array([by @ (s.mean - one.offset) for s, one, by in zip(own, at, back, strict=True)])
@@ -161,8 +168,10 @@ class SensorWatch:
             scatter = means.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else unknown
             power = robust_power(np.array([turned(s.power, by) for s, by in zip(own, back, strict=True)]), bands)
             noise = np.mean(np.square(back), axis=0) @ noise_floor(np.array([s.floor for s in own]), bands)
+            frequency = peak_frequency(np.array([s.peaks for s in own]), noise, bands)
         duration_s = min(counts["samples"] / self._rate_hz, 3600.0)
-        return Hour(number * HOUR_NS, duration_s, counts, temperature, n, mean, scatter, noise, bands.centre_hz, power)
+        return Hour(number * HOUR_NS, duration_s, counts, temperature, n, mean, scatter, noise, bands.centre_hz, power,
+                    *frequency)  # fmt: skip
 
     # --- state
 
@@ -171,7 +180,7 @@ class SensorWatch:
         return {
             "rate_hz": self._rate_hz, "hour": self._hour, "counts": dict(self._counts), "warmth": self._warmth.copy(),
             "segments": [
-                {"degc": degc, "mean": s.mean, "power": s.power, "floor": s.floor} for degc, s in self._segments
+                {"degc": degc, **{name: getattr(s, name) for name in PARTS}} for degc, s in self._segments
             ],
             "held": self._held[:, : self._length].copy(), "zero": self._zero.copy(), "filled": self._filled,
             "sound": self._sound, "next": self._next, "degrees": self._degrees.copy(),
@@ -182,8 +191,9 @@ class SensorWatch:
         self._rate_hz, self._hour, self._counts = state["rate_hz"], state["hour"], dict(state["counts"])
         self._warmth = np.array(state["warmth"])
         self._segments = [
-            (own["degc"], Segment(*(np.array(own[name]) for name in ("mean", "power", "floor"))))
+            (own["degc"], Segment(*(np.array(own[name]) for name in PARTS)))
             for own in state["segments"]
+            if PARTS[-1] in own  # earlier states have no peaks: their minutes do not count
         ]
         self._begin_segment(bands_of(self._rate_hz).samples if self._rate_hz else 0)
         self._length = state["held"].shape[1]

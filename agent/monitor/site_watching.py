@@ -83,9 +83,9 @@ class SiteWatching:
 
     def changed_sites(self) -> list[dict[str, Any]]:
         """The sites of which the structure has changed: `site`, `what`, `since`, `earliest`, `latest`."""
-        names = "what", "since", "earliest", "latest"
+        names = "since", "earliest", "latest"
         return [
-            {"site": site} | {name: told["site"][name] for name in names}
+            {"site": site, "what": _what(told["site"])} | {name: told["site"][name] for name in names}
             for site, told in sorted(self.told.items())
             if told["site"]["verdict"] == "structure"
         ]
@@ -100,7 +100,7 @@ class SiteWatching:
         before, self.told[site] = self.told.get(site), msgspec.json.decode(msgspec.json.encode(told))
         structure = self.told[site]["site"]
         if structure["verdict"] == "structure" and (before is None or before["site"]["verdict"] != "structure"):
-            text = f"structure: {structure['what']} since {structure['since']}"
+            text = f"structure: {_what(structure)} since {structure['since']}"
             self._fleet.note(site, "all", "structure", "watch", view.found.day * DAY_NS + DAY_NS, text, alarm=True)
         keep_told(self._database.query, site, view.found.day, self.told[site])
         self._fleet.set_suspected(site, _suspicions(self.told[site]), view.found.day * DAY_NS + DAY_NS)
@@ -132,3 +132,9 @@ def _suspicions(told: dict[str, Any]) -> dict[tuple[str, str], Suspicion]:
     """What is suspected of sensors, by gateway and name."""
     found = (msgspec.convert(one["suspected"], Suspicion) for one in told["sensors"] if one.get("suspected"))
     return {(one.gateway, one.sensor): one for one in found}
+
+
+def _what(told: dict[str, Any]) -> str:
+    """What has changed of a structure, with its size where there is one."""
+    size, U = told["size"], told["expanded_uncertainty"]
+    return told["what"] if size is None or U is None else f"{told['what']}, by {size:+.2f} ± {U:.2f} %"

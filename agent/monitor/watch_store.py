@@ -26,7 +26,7 @@ from agent.monitor import summaries
 from agent.monitor.engines import QueryRunner
 from agent.monitor.summaries import unpacked
 from agent.site_watch.day_sum import SHAPES, DaySum, Made, summed
-from agent.site_watch.hour import TWICE, CalibrationLine, SelfTestLine, WatchHour, wrong
+from agent.site_watch.hour import TWICE, CalibrationLine, SelfTestLine, WatchHour, grid, places, wrong
 from agent.site_watch.source import SiteSource, WatchError
 from calib.model import Array
 from calib.site_watch.day import HOURS
@@ -52,6 +52,7 @@ CALIBRATIONS = 10  # results in which the one is sought that a sensor had in for
 SELF_TESTS = 100  # results in which that of a day is sought: one a day, and hours are kept for 90 days
 SENT_DAYS = 120  # a sensor without an hour in the last so many days is no longer of the site
 Kind = TypeVar("Kind", bound=msgspec.Struct)
+PLACE, NO_PLACE = 1.0 / 25_000, -(1 << 15)  # 0.001 % of a frequency
 SQLITE = b"SQLite format 3\0"  # how a database begins
 
 
@@ -64,6 +65,7 @@ class _Packed(msgspec.Struct, array_like=True):
     made: Made
     bands: list[float]
     numbers: bytes  # temperature, noise 3, mean 3, u_main 3, then band_power and cross_power
+    peaks: bytes = b""  # places of the peak frequencies as little-endian int16, PLACE of a third octave; NO_PLACE: none
 
 
 _PACKED = msgspec.msgpack.Decoder(_Packed)
@@ -75,8 +77,10 @@ def packed(hour: WatchHour) -> bytes:
     numbers = [hour.temperature_degc, *_three(hour.noise_psd), *_three(hour.mean_mps2), *_three(hour.u_main_pct),
                *hour.band_power, *hour.cross_power]  # fmt: skip
     told = np.array([math.nan if value is None else value for value in numbers], dtype="<f4").tobytes()
+    at = np.array(places(hour), dtype=float) / PLACE
+    peaks = np.where(np.isfinite(at), np.round(np.nan_to_num(at)), NO_PLACE).astype("<i2").tobytes()
     return msgspec.msgpack.encode(
-        _Packed(hour.duration_s, hour.samples, hour.stuck + hour.clipped, hour.made, hour.band_hz, told)
+        _Packed(hour.duration_s, hour.samples, hour.stuck + hour.clipped, hour.made, hour.band_hz, told, peaks)
     )
 
 
@@ -86,14 +90,16 @@ def unpacked_hour(sensor: str, hour: int, data: bytes) -> WatchHour:
     numbers: list[Any] = [
         value if math.isfinite(value) else None for value in np.frombuffer(told.numbers, "<f4").tolist()
     ]
-    b = len(told.bands)
-    if len(numbers) != 10 + 6 * b:
+    b, at = len(told.bands), np.frombuffer(told.peaks, "<i2")
+    if len(numbers) != 10 + 6 * b or len(at) not in (0, 3 * b):
         raise ValueError("an hour of another length")
+    hz = 10.0 ** (0.1 * (np.array(grid(told.bands) * 3)[: len(at)] + PLACE * at))
     return WatchHour(
         sensor=sensor, hour_utc_ns=hour * 3600 * 10**9, duration_s=told.duration_s, samples=told.samples,
         clipped=told.wrong, temperature_degc=numbers[0], noise_psd=numbers[1:4], mean_mps2=numbers[4:7],
         u_main_pct=numbers[7:10], band_hz=told.bands, band_power=numbers[10 : 10 + 3 * b],
         cross_power=numbers[10 + 3 * b :], calibration_run_id=told.made[0], calibration_sequence=told.made[1],
+        peak_frequency_hz=[f if place != NO_PLACE else None for f, place in zip(hz.tolist(), at.tolist(), strict=True)],
     )  # fmt: skip
 
 

@@ -647,7 +647,7 @@ class Clock(_message.Message):
     def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., device: _Optional[str] = ..., role: _Optional[str] = ..., nominal_rate_hz: _Optional[float] = ..., rate_hz: _Optional[float] = ..., u_rate_hz: _Optional[float] = ..., offset_s: _Optional[float] = ..., u_offset_s: _Optional[float] = ..., jitter_s: _Optional[float] = ..., lag_s: _Optional[float] = ..., u_lag_s: _Optional[float] = ..., arrivals: _Optional[int] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Watch(_message.Message):
-    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "hour_utc_ns", "duration_s", "samples", "stuck", "clipped", "missing", "segments", "mean_mps2", "mean_scatter_mps2", "temperature_degc", "temperature_scatter_degc", "noise_psd", "band_hz", "band_power", "cross_power", "calibration_run_id", "calibration_sequence", "u_main_pct", "gravity", "engine", "signature")
+    __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "hour_utc_ns", "duration_s", "samples", "stuck", "clipped", "missing", "segments", "mean_mps2", "mean_scatter_mps2", "temperature_degc", "temperature_scatter_degc", "noise_psd", "band_hz", "band_power", "cross_power", "calibration_run_id", "calibration_sequence", "u_main_pct", "gravity", "peak_frequency_hz", "u_peak_frequency_hz", "engine", "signature")
     EVENT_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     RUN_ID_FIELD_NUMBER: _ClassVar[int]
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
@@ -672,6 +672,8 @@ class Watch(_message.Message):
     CALIBRATION_SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     U_MAIN_PCT_FIELD_NUMBER: _ClassVar[int]
     GRAVITY_FIELD_NUMBER: _ClassVar[int]
+    PEAK_FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    U_PEAK_FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
     ENGINE_FIELD_NUMBER: _ClassVar[int]
     SIGNATURE_FIELD_NUMBER: _ClassVar[int]
     event_sequence: int
@@ -698,9 +700,11 @@ class Watch(_message.Message):
     calibration_sequence: int
     u_main_pct: _containers.RepeatedScalarFieldContainer[float]
     gravity: str
+    peak_frequency_hz: _containers.RepeatedScalarFieldContainer[float]
+    u_peak_frequency_hz: _containers.RepeatedScalarFieldContainer[float]
     engine: str
     signature: bytes
-    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., hour_utc_ns: _Optional[int] = ..., duration_s: _Optional[float] = ..., samples: _Optional[int] = ..., stuck: _Optional[int] = ..., clipped: _Optional[int] = ..., missing: _Optional[int] = ..., segments: _Optional[int] = ..., mean_mps2: _Optional[_Iterable[float]] = ..., mean_scatter_mps2: _Optional[_Iterable[float]] = ..., temperature_degc: _Optional[float] = ..., temperature_scatter_degc: _Optional[float] = ..., noise_psd: _Optional[_Iterable[float]] = ..., band_hz: _Optional[_Iterable[float]] = ..., band_power: _Optional[_Iterable[float]] = ..., cross_power: _Optional[_Iterable[float]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., u_main_pct: _Optional[_Iterable[float]] = ..., gravity: _Optional[str] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
+    def __init__(self, event_sequence: _Optional[int] = ..., run_id: _Optional[str] = ..., sequence: _Optional[int] = ..., sensor: _Optional[str] = ..., t_utc_ns: _Optional[int] = ..., hour_utc_ns: _Optional[int] = ..., duration_s: _Optional[float] = ..., samples: _Optional[int] = ..., stuck: _Optional[int] = ..., clipped: _Optional[int] = ..., missing: _Optional[int] = ..., segments: _Optional[int] = ..., mean_mps2: _Optional[_Iterable[float]] = ..., mean_scatter_mps2: _Optional[_Iterable[float]] = ..., temperature_degc: _Optional[float] = ..., temperature_scatter_degc: _Optional[float] = ..., noise_psd: _Optional[_Iterable[float]] = ..., band_hz: _Optional[_Iterable[float]] = ..., band_power: _Optional[_Iterable[float]] = ..., cross_power: _Optional[_Iterable[float]] = ..., calibration_run_id: _Optional[str] = ..., calibration_sequence: _Optional[int] = ..., u_main_pct: _Optional[_Iterable[float]] = ..., gravity: _Optional[str] = ..., peak_frequency_hz: _Optional[_Iterable[float]] = ..., u_peak_frequency_hz: _Optional[_Iterable[float]] = ..., engine: _Optional[str] = ..., signature: _Optional[bytes] = ...) -> None: ...
 
 class Self_test(_message.Message):
     __slots__ = ("event_sequence", "run_id", "sequence", "sensor", "t_utc_ns", "reason", "response_mps2", "u_response_mps2", "u_supply_pct", "pairs", "motion_mps2", "temperature_degc", "faults", "engine", "signature")

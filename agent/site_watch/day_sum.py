@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from agent.site_watch.hour import SelfTestLine, WatchHour, grid, values
+from agent.site_watch.hour import SelfTestLine, WatchHour, grid, places, values
 from calib.model import Array
+from calib.signal.spectra import THIRD_OCTAVE
 from calib.site_watch.day import HOURS, Day, Hours, SelfTests, Visits, day_of
 
 Made = tuple[str, int]  # CalibrationUpdate.made: run and sequence
@@ -24,12 +25,14 @@ SHAPES = {
     "mean": "n3",
     "u_main": "n",
     "main": "n3",
+    "frequency": "nb3",
     "self_test": "n3",
     "self_test_u": "n3",
     "self_test_supply": "n3",
     "self_test_degc": "n",
 }
 SELF_TEST = "self_test", "self_test_u", "self_test_supply", "self_test_degc"  # as the fields of SelfTests
+EMPTY = {"frequency", *SELF_TEST}  # arrays that may be left out
 
 
 class DaySum(msgspec.Struct, array_like=True, kw_only=True):
@@ -38,7 +41,8 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
     `value` (n, b, 6) to `mean` (n, 3): the fields of calib.site_watch.day.Day, as little-endian float32. `made`: the
     calibration of each sensor in force at the end of the day; `u_main` (n,): its relative standard uncertainty then;
     `main` (n, 3): its main sensitivities, NaN where they are not known. `self_test` and the others: the fields of
-    calib.site_watch.day.SelfTests; empty where no sensor has tested itself.
+    calib.site_watch.day.SelfTests; empty where no sensor has tested itself. `frequency` (n, b, 3): that of Day; empty
+    where no result tells one.
     """
 
     number: int
@@ -57,12 +61,13 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
     self_test_u: bytes = b""
     self_test_supply: bytes = b""
     self_test_degc: bytes = b""
+    frequency: bytes = b""
 
     def array(self, name: str) -> Array:
         """One of the arrays. Raises ValueError where its length is not that of its shape."""
         sizes = {"n": len(self.sensors), "b": len(self.bands), "3": 3, "6": 6}
         shape = [sizes[k] for k in SHAPES[name]]
-        if name in SELF_TEST and not self.self_test:
+        if name in EMPTY and not getattr(self, name):
             return np.full(shape, np.nan)
         return np.frombuffer(getattr(self, name), dtype="<f4").astype(float).reshape(shape)
 
@@ -83,6 +88,7 @@ def summed(
     n, at = len(sensors), {i: k for k, i in enumerate(sensors)}
     place = {band: k for k, band in enumerate(bands)}
     power, cross = (np.full((HOURS, n, len(bands), 3), np.nan) for _ in range(2))
+    frequency = np.full_like(power, np.nan)
     noise, mean, degc = np.full((HOURS, n, 3), np.nan), np.full((HOURS, n, 3), np.nan), np.full((HOURS, n), np.nan)
     made: list[Made] = [("", 0)] * n
     u_main = np.full(n, np.nan)
@@ -90,14 +96,20 @@ def summed(
         h, k, own = hour.hour - HOURS * number, at[i], [place[band] for band in grid(hour.band_hz)]
         power[h, k, own] = _matrix(hour.band_power)
         cross[h, k, own] = _matrix(hour.cross_power)
+        if hour.peak_frequency_hz:
+            frequency[h, k, own] = THIRD_OCTAVE * np.reshape(places(hour), (3, -1)).T
         noise[h, k] = values(hour.noise_psd)
         mean[h, k] = values(hour.mean_mps2) if hour.mean_mps2 else np.nan
         degc[h, k] = math.nan if hour.temperature_degc is None else hour.temperature_degc
         made[k], u_main[k] = hour.made, hour.u_main
-    day = day_of(Hours(HOURS * number + np.arange(HOURS, dtype=float), power, cross, noise, degc, mean), _hz(bands))
+    day = day_of(
+        Hours(HOURS * number + np.arange(HOURS, dtype=float), power, cross, noise, degc, mean, frequency), _hz(bands)
+    )
     main = [mains.get((i, made[k]), np.full(3, np.nan)) for i, k in at.items()]
     parts = {"value": day.value, "u": day.u, "level": day.level, "log_noise": day.log_noise, "mean": day.mean_mps2,
              "u_main": u_main, "main": np.array(main), **_self_tests(sensors, self_tests)}  # fmt: skip
+    if np.isfinite(frequency).any():
+        parts["frequency"] = day.frequency
     return DaySum(number=number, sensors=sensors, bands=bands, temperature_degc=day.temperature_degc, made=made,
                   **{name: np.asarray(part, dtype="<f4").tobytes() for name, part in parts.items()})  # fmt: skip
 
@@ -145,6 +157,8 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
         value[to[:, None], to_bands] = one.array("value")[own[:, None], columns]
         u[to[:, None], to_bands] = one.array("u")[own[:, None], columns]
         level[to_bands] = one.array("level")[columns]
+        frequency = np.full((n, b, 3), np.nan)
+        frequency[to[:, None], to_bands] = one.array("frequency")[own[:, None], columns]
         noise[to], mean[to] = one.array("log_noise")[own], one.array("mean")[own]
         visits = Visits.unknown(np.array([False] * n))
         new_main, new_u = one.array("main"), one.array("u_main")
@@ -157,7 +171,7 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
         tests = [np.full((n, 3) if SHAPES[name] == "n3" else n, np.nan) for name in SELF_TEST]
         for name, array in zip(SELF_TEST, tests, strict=True):
             array[to] = one.array(name)[own]
-        day = Day(one.number, value, u, level, noise, one.temperature_degc, mean, SelfTests(*tests))
+        day = Day(one.number, value, u, level, noise, one.temperature_degc, mean, SelfTests(*tests), frequency)
         yield SiteDay(day, visits, u_main.copy())
 
 

@@ -18,6 +18,7 @@ LEAST_COVERED_S = 1800.0  # of an hour that counts
 MOST_WRONG = 0.01  # part of the samples of an hour that may be stuck or clipped
 BANDS = range(-12, 31)  # third octaves n: 10^(n/10) Hz
 GRID = 0.02  # relative distance from a nominal centre (IEC 61260-1, base 10)
+FARTHEST = 1.1  # third octaves from the centre of its window, in which a peak frequency lies
 YEARS_H = (262_968, 1_139_568)  # 2000 to 2100, in hours since 1970
 TWICE = "an hour of a sensor twice; the one with the higher sequence is used"
 
@@ -46,6 +47,7 @@ class WatchHour(msgspec.Struct, kw_only=True):
     calibration_run_id: str = ""
     calibration_sequence: int = 0
     u_main_pct: Numbers = []
+    peak_frequency_hz: Numbers = []
 
     @property
     def hour(self) -> int:
@@ -140,6 +142,9 @@ def wrong(hour: WatchHour) -> str:
         (len(hour.mean_mps2) not in (0, 3)
          or any(value is not None and not abs(value) <= LARGEST_MEAN for value in hour.mean_mps2),
          f"mean_mps2 is not three values within {LARGEST_MEAN:g} m/s2"),
+        (len(hour.peak_frequency_hz) not in (0, 3 * b)
+         or not all(math.isnan(place) or abs(place) <= FARTHEST for place in places(hour)),
+         "peak_frequency_hz are not three values for each of band_hz, each within a third octave of it"),
         (not hour.duration_s >= LEAST_COVERED_S or hour.samples <= 0,
          f"less than {LEAST_COVERED_S:g} s of the hour are covered"),
         (hour.stuck + hour.clipped > MOST_WRONG * hour.samples,
@@ -156,6 +161,15 @@ def grid(band_hz: list[float]) -> list[int]:
         if n in BANDS and abs(f / 10.0 ** (n / 10.0) - 1.0) <= GRID:
             numbers.append(n)
     return numbers
+
+
+def places(hour: WatchHour) -> list[float]:
+    """Where each peak frequency lies from the nominal centre of its band, in third octaves; NaN where there is none."""
+    centres = grid(hour.band_hz) * 3
+    return [
+        math.nan if hz is None else 10.0 * math.log10(hz) - n if hz > 0.0 else math.inf
+        for hz, n in zip(hour.peak_frequency_hz, centres, strict=False)
+    ]
 
 
 def values(told: Numbers) -> Array:

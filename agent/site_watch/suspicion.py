@@ -163,6 +163,12 @@ def sentence(told: SensorVerdict) -> str:
     return f"{change} since {since(told)}: {', '.join(heard)}"
 
 
+def frequency_sentence(told: SensorVerdict) -> str:
+    """A natural frequency that has changed, in words."""
+    moved = "fallen" if told.size < 0.0 else "risen"
+    return f"{told.what}, has {moved} by {sized(told).lstrip('+-')} since {since(told)}: the structure has changed"
+
+
 def _heard(one: Witness) -> str:
     name = f"the {one.name}" if one.name in ("structure", "self-test") else one.name
     if one.says == "silent":
@@ -184,7 +190,7 @@ def relative(told: SensorVerdict) -> tuple[float, float]:
     """Size and U of a verdict as a part of the sensitivity; the watch tells its logarithm. An angle or a noise as it
     is.
     """
-    if told.kind in ("sensitivity", "gateway", "common"):
+    if told.kind in ("sensitivity", "gateway", "common", "structure"):
         return math.expm1(told.size), math.exp(told.size) * told.U
     return told.size, told.U
 

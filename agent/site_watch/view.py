@@ -14,7 +14,17 @@ import numpy as np
 from agent import __version__
 from agent.site_watch.day_sum import days_of
 from agent.site_watch.source import SiteSource
-from agent.site_watch.suspicion import AXES_OF, Suspicion, date, relative, sentence, since, sized, witness_of
+from agent.site_watch.suspicion import (
+    AXES_OF,
+    Suspicion,
+    date,
+    frequency_sentence,
+    relative,
+    sentence,
+    since,
+    sized,
+    witness_of,
+)
 from calib.model import Array
 from calib.site_watch.verdicts import COVERAGE, WALK_PER_ROOT_DAY, SensorVerdict, SiteVerdicts, result
 from calib.site_watch.visits import teach
@@ -71,9 +81,10 @@ class SiteView:
 
     @property
     def sentences(self) -> list[str]:
-        """What is suspected of each sensor, with its witnesses, in the order of visits."""
+        """The frequency that has changed; what is suspected of sensors, with witnesses, in the order of visits."""
         told = [one for i, _ in self.order if (one := self.suspected(i)) is not None and one.witnesses]
-        return [f"{one.gateway}/{one.sensor}: {one.text}" for one in told]
+        frequencies = [frequency_sentence(one) for one in self.found.frequencies[:1]]
+        return frequencies + [f"{one.gateway}/{one.sensor}: {one.text}" for one in told]
 
 
 def seen(source: SiteSource, beside_reference: Sequence[int] = ()) -> SiteView:
@@ -180,6 +191,7 @@ def as_object(what: SiteView) -> dict[str, Any]:
         "changed": what.changed,
         "limit": found.limit,
         "site": _told(found.site),
+        "frequencies": [{"frequency_hz": one.hz, **_told(one)} for one in found.frequencies],
         "gateways": {source.gateways[g]: _told(told) for g, told in found.gateways.items()},
         "sensors": [
             {

@@ -37,7 +37,8 @@ class Hours:
 
     `hour` (H,): hours since 1970 in UTC. `power`, `cross` (H, n, B, 3): mean squares of x, y, z and real cross
     powers xy, xz, yz, (m/s²)². `noise_psd` (H, n, 3), (m/s²)²/Hz. `temperature_degc` (H, n). `mean_mps2` (H, n, 3):
-    mean of the outputs, None where no result tells it.
+    mean of the outputs, None where no result tells it. `frequency` (H, n, B, 3): log of the peak frequency over the
+    centre of the band, None where no result tells it.
     """
 
     hour: Array
@@ -46,6 +47,7 @@ class Hours:
     noise_psd: Array
     temperature_degc: Array
     mean_mps2: Array | None = None
+    frequency: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +69,8 @@ class Day:
     """One day. `value`, `u` (n, B, 6): the channels with the standard uncertainty that their noise gives; NaN and inf
     where a channel does not count. `level` (B, 3): log amplitude of the level. `log_noise` (n, 3): half the log of the
     noise floor. `temperature_degc`: the median of all sensors; NaN where none tells one. `mean_mps2` (n, 3): the median
-    of the hours. `self_tests`: None where no sensor has one.
+    of the hours. `self_tests`: None where no sensor has one. `frequency` (n, B, 3): log of the peak frequency over the
+    centre of the band, NaN where too few hours tell it.
     """
 
     number: int
@@ -78,6 +81,7 @@ class Day:
     temperature_degc: float
     mean_mps2: Array | None = None
     self_tests: SelfTests | None = None
+    frequency: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +131,14 @@ def day_of(hours: Hours, band_hz: Array) -> Day:
         0.5 * np.log(_positive(_median(hours.noise_psd))),
         float(np.median(temperatures)) if temperatures.size else np.nan,
         None if hours.mean_mps2 is None else _median(hours.mean_mps2),
+        frequency=None if hours.frequency is None else _frequency(hours.frequency),
     )
+
+
+def _frequency(hours: Array) -> Array:
+    """The peak frequency of a day (n, B, 3), from its hours."""
+    enough = np.sum(np.isfinite(hours), axis=0) >= FEWEST_HOURS
+    return np.where(enough, _clipped_mean(hours), np.nan)
 
 
 def _polished(amplitude: Array) -> tuple[Array, Array]:

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from calib.distributions import NORMAL, student_quantile
 from calib.model import Array
+from calib.site_watch import frequencies
+from calib.site_watch.frequencies import FrequencyChange
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR_DEGREES, TERMS, Steps
 from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, jointly, median
@@ -26,8 +28,9 @@ FEWEST_DAYS = 21  # that teach the norm of a sensor
 FEWEST_SINCE = 3  # days after a step, before it is told
 WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk after a day: 0.06 % in a year
 COVERAGE = 2.0
-# Factor of u for what the norm does not fit over seasons; from the sound sites of benchmarks/site_watch.py.
-MISFIT = 1.15
+# Factor of u for what the norm does not fit over seasons, for each standard deviation of the limit: tails are heavier
+# than those of a normal distribution, the more the farther out. From the sound sites of benchmarks/site_watch.py.
+MISFIT = 0.242
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 FEWEST_BANDS = 3  # for bands to be called alike
 NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
@@ -36,6 +39,7 @@ MONTH_DAYS = 30  # after a change, of which the least detectable one is told
 VISITS_DAYS = 400  # for which what a visit found says how far all sensors have changed alike
 LONGEST_DAYS = 365  # of the norm, over which the walk counts
 LEAST_VARIANCE = 0.2  # of a channel's variance, that a step leaves
+FOLLOW = "sensitivity", "turn", "sensor or structure", "gateway"  # what may follow from a change of a frequency
 EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told apart (2 standard deviations)
 
 
@@ -47,7 +51,7 @@ class SensorVerdict:
     `size`, `U`: change of the log of the sensitivity (relative change of the amplitude of the noise), or angle in
     rad; expanded by COVERAGE. `since`, `earliest`, `latest`: days since 1970. `statistic`: size over its standard
     uncertainty, or a normal equivalent. `direction`: index in calib.site_watch.together.DIRECTIONS of a sensitivity
-    or turn; -1 for others.
+    or turn; -1 for others. `hz`: the natural frequency that has changed; NaN for others.
     `witnesses`: of a sensitivity or turn, the structure first.
     """
 
@@ -61,6 +65,7 @@ class SensorVerdict:
     statistic: float = 0.0
     direction: int = -1
     witnesses: tuple[Witness, ...] = ()
+    hz: float = np.nan
 
 
 NOTHING = SensorVerdict("none")
@@ -74,7 +79,8 @@ class SiteVerdicts:
     sensitivity of x, y, z that is found 30 days after it in half of the cases. `days` (n,): days that teach the
     norm. `seen_degc` (n, 2): range of temperature in the norm. `outside`: today's temperature is beyond what the
     sensor's norm has seen. `common`: change that all sensors share, against those beside a reference, or else by what
-    visits found; None without such. `hidden`: a common change below this size is not seen (relative).
+    visits found; None without such. `hidden`: a common change below this size is not seen (relative). `frequencies`:
+    natural frequencies that have changed, the surest first; bands in which one lies tell nothing else.
     """
 
     day: int
@@ -88,6 +94,7 @@ class SiteVerdicts:
     common: SensorVerdict | None
     hidden: float
     limit: float
+    frequencies: tuple[SensorVerdict, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,13 +108,18 @@ class Tests:
     bands: Array
 
     def dated(self, squared: Array) -> tuple[int, tuple[int, int, int]]:
-        """Index of the likeliest begin; its day, and the first and last day that are not told apart from it."""
-        best = int(np.argmax(squared))
-        near = np.flatnonzero(squared >= squared[best] - EVIDENCE_DROP)
-        first, last = int(near[0]), int(near[-1])  # between these and the next begins none is kept
-        earliest = self.begins[first - 1] + 1 if first else self.begins[0]
-        latest = self.begins[last + 1] - 1 if last + 1 < len(self.begins) else self.begins[last]
-        return best, (self.begins[best], earliest, latest)
+        """As `dated`, at the begins of these tests."""
+        return dated(self.begins, squared)
+
+
+def dated(begins: list[int], squared: Array) -> tuple[int, tuple[int, int, int]]:
+    """Index of the likeliest begin; its day, and the first and last day that are not told apart from it."""
+    best = int(np.argmax(squared))
+    near = np.flatnonzero(squared >= squared[best] - EVIDENCE_DROP)
+    first, last = int(near[0]), int(near[-1])  # between these and the next begins none is kept
+    earliest = begins[first - 1] + 1 if first else begins[0]
+    latest = begins[last + 1] - 1 if last + 1 < len(begins) else begins[last]
+    return best, (begins[best], earliest, latest)
 
 
 def limit_of(sensors: int, gateways: int, per_year: float = FALSE_ALARMS_PER_YEAR) -> float:
@@ -126,14 +138,16 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
     sensors = [NOTHING if d >= FEWEST_DAYS + FEWEST_SINCE else SensorVerdict("learning") for d in days]
     gateways: dict[int, SensorVerdict] = {}
     site, common, least = NOTHING, None, np.full((n, 3), np.inf)
-    tests = examined(watch)
+    changed = _frequencies(watch)
+    tests = examined(watch, frequencies.moved_bands(watch.band_hz, [one for one, _ in changed]))
     if tests is not None:
         floors = _noise(watch, limit)
         for i in range(n):
             if sensors[i].kind == "none" and not anchored[i]:
                 sensors[i] = _sensor(tests, i, limit, floors[i])
         gateways = _gateways(watch, tests, sensors, limit)
-        site = _structure(tests, sensors)
+        _follow_frequencies([told for _, told in changed], sensors, gateways)
+        site = max(_structure(tests, sensors), *(told for _, told in changed), NOTHING, key=lambda one: one.statistic)
         if known_u is not None and anchored.any():
             common = _common_change(tests, known_u[anchored], anchored)
         sensors = [witnessed(watch, i, told) for i, told in enumerate(sensors)]
@@ -143,27 +157,79 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
     outside = (watch.degc < watch.seen_degc[:, 0]) | (watch.degc > watch.seen_degc[:, 1])
     hidden = common.U if common is not None else np.inf
     return SiteVerdicts(
-        watch.day, sensors, gateways, site, least, days, watch.seen_degc.copy(), outside, common, hidden, limit
+        watch.day,
+        sensors,
+        gateways,
+        site,
+        least,
+        days,
+        watch.seen_degc.copy(),
+        outside,
+        common,
+        hidden,
+        limit,
+        tuple(told for _, told in changed),
     )
 
 
-def examined(watch: SiteWatch) -> Tests | None:
-    """The joint test at all begins with enough days before and since; None where there is none."""
+def _begins(watch: SiteWatch) -> list[int]:
+    """Which begins of steps have enough days before and since."""
+    begins = watch.steps.begins
+    return [k for k, begin in enumerate(begins)
+            if watch.day - begin + 1 >= FEWEST_SINCE and begin - begins[0] >= FEWEST_DAYS]  # fmt: skip
+
+
+def _frequencies(watch: SiteWatch) -> list[tuple[FrequencyChange, SensorVerdict]]:
+    """Natural frequencies that have changed, the surest first."""
+    which = _begins(watch)
+    if not which:
+        return []
+    found = frequencies.joined(watch, which, (FEWEST_DAYS, FEWEST_SINCE), LONGEST_DAYS)
+    told = []
+    for one in frequencies.changed(watch, found, frequencies.limit_of(watch.shape[1], LOOKS_PER_YEAR)):
+        _, dates = dated([watch.steps.begins[k] for k in which], one.squared)
+        what = f"natural frequency near {one.hz:.3g} Hz, at {one.sensors[0]} of {one.sensors[1]} sensors"
+        verdict = SensorVerdict("structure", what, one.size, COVERAGE * one.u, *dates, one.statistic, hz=one.hz)
+        told.append((one, verdict))
+    return told
+
+
+def _follow_frequencies(
+    changed: list[SensorVerdict], sensors: list[SensorVerdict], gateways: dict[int, SensorVerdict]
+) -> None:
+    """What sensors and gateways show since the day of a change of a frequency follows from it: the skirts of a mode
+    reach far, so it is not told of them."""
+
+    def follows(told: SensorVerdict) -> bool:
+        return told.kind in FOLLOW and any(
+            one.earliest - FEWEST_SINCE <= told.since <= one.latest + FEWEST_SINCE for one in changed
+        )
+
+    sensors[:] = [NOTHING if follows(told) else told for told in sensors]
+    for number in [number for number, told in gateways.items() if follows(told)]:
+        del gateways[number]
+
+
+def examined(watch: SiteWatch, without: NDArray[np.bool_] | None = None) -> Tests | None:
+    """The joint test at all begins with enough days before and since; None where there is none. `without` (B,): bands
+    that do not count."""
     begins, shape = watch.steps.begins, watch.shape
-    which = [k for k, begin in enumerate(begins)
-             if watch.day - begin + 1 >= FEWEST_SINCE and begin - begins[0] >= FEWEST_DAYS]  # fmt: skip
+    which = _begins(watch)
     if not which:
         return None
     size, information, since = (part.reshape(-1, *shape) for part in watch.steps.step(which))
     days, variance = watch.steps.days.reshape(shape), watch.variance()
     counts = (since >= FEWEST_SINCE) & (days - since >= FEWEST_DAYS)
+    if without is not None:
+        counts &= ~without[:, None]
     information = np.where(counts, information / _without(variance, size, information, days), 0.0)
     ages = np.array([watch.day - begins[k] + 1 for k in which], dtype=float)
     before = np.minimum([begins[k] - begins[0] for k in which], LONGEST_DAYS)
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
-    inflation = MISFIT**2 * watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
+    limit = limit_of(shape[0], len(set(watch.gateway.tolist())))
+    inflation = (MISFIT * limit) ** 2 * watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
     joint = jointly(size, information, watch.G, inflation, walk)
-    apart = _apart(joint, watch.G)
+    apart = _apart(joint, watch.G, MISFIT * limit)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
     return Tests([begins[k] for k in which], joint, apart, bands)
 
@@ -174,7 +240,7 @@ def _without(variance: Array, size: Array, information: Array, days: Array) -> A
     return np.asarray(np.maximum(variance - size**2 * information / freedom, LEAST_VARIANCE * variance))
 
 
-def _apart(joint: JointChange, G: Array) -> Array:
+def _apart(joint: JointChange, G: Array, misfit: float) -> Array:
     """How much the bands of each sensor differ from any change of its sensitivities and any turn, (k, n).
 
     What most sensors show, such as days that the norm does not fit, is taken as scatter.
@@ -192,7 +258,7 @@ def _apart(joint: JointChange, G: Array) -> Array:
     freedom = np.sum(info > 0.0, axis=-1) - g.shape[-1]
     f = np.maximum(freedom, 1).astype(float)
     site = median(np.where(freedom > 0, squares / f, np.nan), axis=1)
-    ratio = squares / f / (MISFIT * np.maximum(site, 1.0))[:, None]
+    ratio = squares / f / (misfit * np.maximum(site, 1.0))[:, None]
     deviate = (np.cbrt(ratio) - (1.0 - 2.0 / (9.0 * f))) / np.sqrt(2.0 / (9.0 * f))
     return np.asarray(np.where(freedom > 0, deviate, -np.inf))
 
@@ -263,12 +329,13 @@ def _noise(watch: SiteWatch, limit: float) -> list[SensorVerdict]:
 
 def _gateways(watch: SiteWatch, tests: Tests, sensors: list[SensorVerdict], limit: float) -> dict[int, SensorVerdict]:
     """All sensors of a gateway alike, against the median of all gateways. A sensor that its gateway explains is not
-    told."""
+    told, and one whose bands change differently says nothing of its gateway."""
     numbers, index = np.unique(watch.gateway, return_inverse=True)
     told: dict[int, SensorVerdict] = {}
     if len(numbers) < 2:
         return told
-    mean, u, fits = _means(tests.joint, index)
+    alike = np.array([told.kind != "sensor or structure" for told in sensors])
+    mean, u, fits = _means(tests.joint, index, alike)
     pair = len(numbers) == 2
     what = "the two gateways differ; which of them changed is not seen" if pair else "all its sensors alike"
     for g, number in enumerate(numbers.tolist()[: 1 if pair else None]):
@@ -276,7 +343,7 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[SensorVerdict], limi
         best, dates = tests.dated(np.square(mean[:, g] / u[:, g]))
         z = abs(float(mean[best, g] / u[best, g]))
         alone = np.abs(tests.joint.statistic[best, own, SENSITIVITIES]).max()
-        if z > max(limit, alone) and fits[best, g] and own.sum() > 1:
+        if z > max(limit, alone) and fits[best, g] and (own & alike).sum() > 1:
             told[number] = SensorVerdict("gateway", what, float(mean[best, g]), COVERAGE * float(u[best, g]), *dates, z)
     for i, verdict in enumerate(sensors):
         if verdict.kind == "sensitivity" and told and (pair or int(watch.gateway[i]) in told):
@@ -284,10 +351,10 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[SensorVerdict], limi
     return told
 
 
-def _means(joint: JointChange, index: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """Mean change of the sensors of each gateway against the median of the gateways (k, g), its u, and whether its
-    sensors agree. Of two gateways: their difference."""
-    s, weight = joint.size[:, :, ALL], 1.0 / np.square(joint.u[:, :, ALL])
+def _means(joint: JointChange, index: NDArray[np.int64], counts: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """Mean change of those sensors of each gateway that count, against the median of the gateways (k, g), its u,
+    and whether its sensors agree. Of two gateways: their difference."""
+    s, weight = joint.size[:, :, ALL], counts / np.square(joint.u[:, :, ALL])
     member = np.eye(index.max() + 1)[index]  # (n, g)
     total = weight @ member
     mean = np.where(total > 0.0, (weight * s) @ member / np.where(total > 0.0, total, 1.0), np.nan)

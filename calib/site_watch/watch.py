@@ -24,6 +24,7 @@ FEWEST_SENSORS = 3  # with a band, for its common level to be taken out
 CHANNELS = 6
 WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
 U_SELF_TEST = 0.001  # of the log of a response, however little it scatters; only ratios of weights depend on it
+U_FREQUENCY = 0.001  # of the peak frequency of a day; only ratios of weights, and the prior, depend on it
 U_MEAN_MPS2 = 0.001  # of the mean of a day; only ratios of weights depend on it
 # The prior of the coefficients of the mean, in m/s² where steps.PRIOR has log amplitudes, is ten times as wide.
 MEAN_PRIOR_SCALE = 0.01
@@ -44,12 +45,14 @@ class SiteWatch:
         self.noise = Steps(self.shape[0] * 3)
         self.means = Steps(self.shape[0] * 3, MEAN_PRIOR_SCALE)
         self.self_tests = Steps(self.shape[0] * 3)
+        self.frequencies = Steps(self.shape[0] * self.shape[1] * 3)
         self.u_supply = np.full((self.shape[0], 3), np.nan)  # of the newest self-test
         self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)))
         self.band_scatter = Blocks(self.shape, lags=(1, 7))
         self.noise_scatter = Blocks((self.shape[0], 3))
         self.mean_scatter = Blocks((self.shape[0], 3))
         self.self_test_scatter = Blocks((self.shape[0], 3))
+        self.frequency_scatter = Blocks((self.shape[1] * 3, 1))  # of all sensors together
         self.visits = np.zeros((0, len(VISIT)))  # of each visit that taught something
         self.origin = np.full((self.shape[1], 3), np.nan)  # levels of the first day
         self.seen_degc = np.tile([np.inf, -np.inf], (self.shape[0], 1))
@@ -92,6 +95,7 @@ class SiteWatch:
         u_mean = np.full((self.shape[0], 3), U_MEAN_MPS2)
         self._follow(self.means, self.mean_scatter, np.broadcast_to(mean, u_mean.shape), u_mean, degc)
         self._take_self_tests(day, visited)
+        self._take_frequencies(day, x)
         self._seen(there.sum(axis=(1, 2)) > 0)
         mean = self.steps.beta[0].reshape(self.shape)
         self.G = design(np.where(self.steps.days.reshape(self.shape) > 0, mean, np.nan), np.nan_to_num(self.origin))
@@ -179,6 +183,26 @@ class SiteWatch:
         degc = np.where(np.isfinite(own), own, day.temperature_degc)
         self._follow(self.self_tests, self.self_test_scatter, response, u, degc, squared=True)
 
+    def _take_frequencies(self, day: Day, x: Array) -> None:
+        """Peak frequencies are followed as the channels are. A visit does not touch them. `x`: as for the channels."""
+        shape = (*self.shape[:2], 3)
+        told = np.full(shape, np.nan) if day.frequency is None else day.frequency
+        there, steps = np.isfinite(told), self.frequencies
+        x = x.reshape(TERMS, *self.shape)[..., :3].reshape(TERMS, -1)
+        expected, u2 = steps.expected(x)
+        variance = pooled(*steps.rest(), shape) * (U_FREQUENCY**2 + u2.reshape(shape))
+        known = there & (steps.days.reshape(shape) - TERMS >= FEWEST_LEFT)
+        z = np.where(known, told - expected.reshape(shape), 0.0) / np.sqrt(np.maximum(variance, 1e-18))
+        information = np.where(known, 1.0 / np.maximum(variance, 1e-18), 0.0)
+        total = information.sum(axis=0)
+        score = np.sum(np.sqrt(information) * np.clip(z, -HUBER, HUBER), axis=0) / np.sqrt(
+            np.where(total > 0.0, total, 1.0)
+        )
+        self.frequency_scatter.update(score.reshape(-1, 1), total.reshape(-1, 1) > 0.0)
+        weight = there / U_FREQUENCY**2 * np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9))
+        steps.update(self.day, x, np.nan_to_num(told).ravel(), weight.ravel())
+        self.frequency_scatter.remember(steps.begins)
+
     def _follow(
         self, steps: Steps, scatter: Blocks, told: Array, u: Array, degc: Array, *, squared: bool = False
     ) -> None:
@@ -208,8 +232,8 @@ class SiteWatch:
 
 _OWN = ("origin", "seen_degc", "degc", "G", "visits", "u_supply")
 _PARTS = (
-    *("steps", "noise", "means", "self_tests"),
-    *("days_scatter", "band_scatter", "noise_scatter", "mean_scatter", "self_test_scatter"),
+    *("steps", "noise", "means", "self_tests", "frequencies"),
+    *("days_scatter", "band_scatter", "noise_scatter", "mean_scatter", "self_test_scatter", "frequency_scatter"),
 )
 
 

@@ -77,7 +77,8 @@ def test_what_feels_no_gravity_or_has_no_scatter_says_nothing() -> None:
 
 def hour(mean: Array, degc: float, segments: int = 60) -> Hour:
     none = np.full(3, np.nan)
-    return Hour(0, 3600.0, {}, (degc, 0.0), segments, mean, none, none, np.zeros(0), np.zeros((6, 0)))
+    bands = np.zeros((6, 0))
+    return Hour(0, 3600.0, {}, (degc, 0.0), segments, mean, none, none, np.zeros(0), bands, bands[:3], bands[:3])
 
 
 def law(u_per_k: float = 0.0) -> Law:

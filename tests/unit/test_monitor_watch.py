@@ -22,7 +22,8 @@ from agent.monitor.engines import DatabaseEngine, Sqlite
 from agent.monitor.fleet import Fleet
 from agent.monitor.site_watching import SiteWatching
 from agent.monitor.watch_store import KEPT_DAYS, close_day, packed, source_of, unpacked_hour
-from agent.site_watch.hour import TWICE, WatchHour
+from agent.site_watch.day_sum import DaySum, days_of, summed
+from agent.site_watch.hour import TWICE, WatchHour, wrong
 from tests.unit.postgres import postgres
 from tests.unit.results import calibration, status
 from tests.unit.test_fleet_watch import FIRST_H, HOUR_NS, lines, self_test
@@ -74,8 +75,38 @@ def test_an_hour_comes_back_as_it_was_to_seven_digits(rows: list[dict[str, Any]]
     for name in ("band_power", "cross_power", "noise_psd", "mean_mps2", "u_main_pct", "band_hz"):
         assert getattr(again, name) == pytest.approx(getattr(hour, name), rel=1e-7), name
     assert len(packed(hour)) < 200 + 6 * 4 * (4 + 9)
+    assert again.peak_frequency_hz == []
     with pytest.raises(ValueError, match="another length"):
         unpacked_hour("c", 1, msgspec.msgpack.encode([3600.0, 1, 0, ["", 0], [1.0], b"\0" * 8]))
+
+
+def test_peak_frequencies_of_an_hour_are_kept_to_a_hundred_thousandth(rows: list[dict[str, Any]]) -> None:
+    told = [hz * factor for factor in (0.8, 1.0, 1.25) for hz in rows[0]["band_hz"]]
+    hour = msgspec.convert(received(rows[7], peak_frequency_hz=[None, *told[1:]]).fields, WatchHour)
+    assert wrong(hour) == ""
+    again = unpacked_hour(hour.sensor, hour.hour, packed(hour))
+    assert again.peak_frequency_hz[0] is None
+    assert again.peak_frequency_hz[1:] == pytest.approx(told[1:], rel=1e-5)
+    assert len(packed(hour)) <= len(packed(msgspec.structs.replace(hour, peak_frequency_hz=[]))) + 2 * 12 + 2
+    # A row of an earlier version ends before them.
+    earlier = msgspec.msgpack.encode(msgspec.msgpack.decode(packed(hour))[:-1])
+    assert unpacked_hour(hour.sensor, hour.hour, earlier).band_power == pytest.approx(hour.band_power, rel=1e-6)
+    for peaks in (told[1:], [*told[1:], 3.0 * told[-1]], [*told[1:], 0.0]):
+        assert "peak_frequency_hz are not" in wrong(msgspec.structs.replace(hour, peak_frequency_hz=peaks))
+
+
+def test_the_frequency_of_a_day_is_in_its_sum_and_earlier_sums_have_none(rows: list[dict[str, Any]]) -> None:
+    peaks = [1.02 * hz for hz in rows[0]["band_hz"]] * 3
+    sums = []
+    for told in (peaks, []):
+        hours = [(0, msgspec.convert(received(row, peak_frequency_hz=told).fields, WatchHour)) for row in rows[:144:6]]
+        one = summed(hours[0][1].day, hours, {}, {})
+        sums.append(msgspec.msgpack.decode(msgspec.msgpack.encode(one), type=DaySum))
+    days = [next(iter(days_of([one], [0], one.bands))).day for one in sums]
+    assert days[0].frequency == pytest.approx(np.full((1, 4, 3), np.log(1.02)), abs=2e-3)
+    assert days[1].frequency is not None
+    assert np.isnan(days[1].frequency).all()
+    assert len(sums[1].frequency) == 0
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ MIXED = np.array([[1.0, 0.0, 0.0], [0.8, 1.0, 0.0], [-0.7, 0.3, 2.0]])
 
 def minutes(x: Array, bands: Bands) -> tuple[Array, Array]:
     """The power (n, 6, B) and the floor (n, 3, G) of whole segments of x (3, n * samples)."""
-    made = [segment_of(part, bands) for part in np.split(x, x.shape[1] // bands.samples, axis=1)]
+    made = [segment_of(part, bands, np.eye(3)) for part in np.split(x, x.shape[1] // bands.samples, axis=1)]
     return np.array([one.power for one in made]), np.array([one.floor for one in made])
 
 
@@ -94,4 +94,6 @@ def test_motion_in_most_lines_is_no_noise() -> None:
 def test_power_along_other_axes_is_that_of_the_turned_outputs() -> None:
     bands, rng = bands_of(RATE_HZ), np.random.default_rng(5)
     x = rng.standard_normal((3, bands.samples))
-    assert turned(segment_of(x, bands).power, MIXED) == pytest.approx(segment_of(MIXED @ x, bands).power, rel=1e-9)
+    assert turned(segment_of(x, bands, np.eye(3)).power, MIXED) == pytest.approx(
+        segment_of(MIXED @ x, bands, np.eye(3)).power, rel=1e-9
+    )

@@ -32,7 +32,7 @@ export const suspectedUsable = ({ suspected: s }) => ["warn", [make("b", "Values
 export const suspectedSteps = (row) => [make("p", `${row.suspected.turn ? "Look whether its mount has turned, then compare it with a reference" : "Compare it with a reference, and look at its mount"}, on gateway ${clean(`${row.site}/${row.gateway}`)}:`), copier(`fieldcal visit gateway.toml --data-dir visit --sensor ${clean(row.sensor)}`)];
 
 // A card for a site of which the structure has changed.
-export const structureCard = ({ site, what, since, earliest, latest }) => card({ kind: "structure", name: `site ${clean(site)}`, where: "all sensors together", say: ["The structure has changed: ", what, " since ", ...when({ since, earliest, latest }), "."], more: "Bands change differently at several sensors, which no sensitivity does.", plot: null, steps: [make("p", "Look at the structure at these sensors. On a machine with the data of the monitor:"), copier("fieldcal fleet watch monitor/monitor.sqlite")] });
+export const structureCard = ({ site, what, since, earliest, latest }) => card({ kind: "structure", name: `site ${clean(site)}`, where: "all sensors together", say: ["The structure has changed: ", what, " since ", ...when({ since, earliest, latest }), "."], more: "No change of a sensitivity does so.", plot: null, steps: [make("p", "Look at the structure at these sensors. On a machine with the data of the monitor:"), copier("fieldcal fleet watch monitor/monitor.sqlite")] });
 
 // The card of the view of a sensor: what the site says of it, or why it says nothing. `shown`: whether it still is shown.
 export async function showSiteWatch(place, shown) {
