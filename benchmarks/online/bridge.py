@@ -103,7 +103,7 @@ class Bridge(Building):
         if not self._vertical:
             return blocks
         return [
-            replace(b, indications=np.ascontiguousarray(b.indications[:, 2:])) if b.device == "reference" else b
+            replace(b, indications=b.indications[:, 2:].astype(np.float64)) if b.device == "reference" else b
             for b in blocks
         ]
 
@@ -329,7 +329,7 @@ class Hour:
 class Month:
     """One run. `valid`, `held`: the shares of windows after which the status was so. `beyond`: in how many windows the
     worst element in force was beyond 3 u and 4 u while VALID; `unseen`: how many of the latter were between an event
-    and the window that told it. `u_pct` of the main sensitivities before the first event and in the end, relative.
+    and the window that told it. `u_pct` of the determined main sensitivities before the first event and in the end, relative.
 
     Of each event that was `told` by name: after how many windows, the error of the change of S after twelve more
     windows (see `error_of_change`), and what was said.
@@ -385,9 +385,14 @@ def month(job: Job, hours: Sequence[Hour]) -> Month:
             told[event] = k - first + 1, error_of_change(before, hours[k + SETTLED]), text
     beyond = [sum(hour.worst > most and hour.status == "VALID" for hour in hours) for most in (3.0, 4.0)]
     share = {name: sum(hour.status == name for hour in hours) / len(hours) for name in ("VALID", "HELD")}
-    ends = [hours[k].u[MAIN] / np.abs(hours[k].value[MAIN]) for k in (at_visit("shock") - 1, -1)]
-    u_pct = 100.0 * float(ends[0].max()), 100.0 * float(ends[1].max())
+    u_pct = _u_main_pct(hours[at_visit("shock") - 1]), _u_main_pct(hours[-1])
     return Month(job, share["VALID"], share["HELD"], (beyond[0], beyond[1]), unseen, u_pct, told)
+
+
+def _u_main_pct(hour: Hour) -> float:
+    """The largest of the determined main sensitivities, relative."""
+    told = np.flatnonzero(hour.determined[MAIN])
+    return 100.0 * float(np.max((hour.u[MAIN] / np.abs(hour.value[MAIN]))[told], initial=0.0))
 
 
 def error_of_change(before: Hour, later: Hour) -> float:

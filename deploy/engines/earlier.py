@@ -75,6 +75,9 @@ REVISIONS = (
     Revision(17, "1cf1dd153582", "0.3.0"),
     # The last before bands into which motion leaks are left out, and before the noise of bands is no deviation.
     Revision(18, "0746c1187b6e", "0.3.0"),
+    # The last before motion across a uniaxial reference was taken for another response, and at a fixed mount for a
+    # change of S.
+    Revision(19, "a65bd293c7b7", "0.3.0"),
 )
 
 
