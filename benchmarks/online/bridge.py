@@ -329,7 +329,8 @@ class Hour:
 class Month:
     """One run. `valid`, `held`: the shares of windows after which the status was so. `beyond`: in how many windows the
     worst element in force was beyond 3 u and 4 u while VALID; `unseen`: how many of the latter were between an event
-    and the window that told it. `u_pct` of the determined main sensitivities before the first event and in the end, relative.
+    and the window that told it. `u_pct` of the main sensitivities that are determined, before the
+    first event and in the end, relative.
 
     Of each event that was `told` by name: after how many windows, the error of the change of S after twelve more
     windows (see `error_of_change`), and what was said.
