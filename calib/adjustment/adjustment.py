@@ -24,10 +24,11 @@ from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import KnownResponses, ResponseTold, response_told, told_at_one_frequency
-from calib.model import Array, Calibration, Window, own_channels
-from calib.windows.bands import motion_band_hz
+from calib.model import Array, Calibration, Window
+from calib.windows.banded import Factors
+from calib.windows.bands import LEAST_SHARE, motion_band_hz
 from calib.windows.condense import Condensed, condense, effective
-from calib.windows.excited import excited_together
+from calib.windows.excited import Excitation, excited_together
 from calib.windows.never_turned import mean_input, never_turned
 
 SCATTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
@@ -176,7 +177,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     model = priors.response_model
     to_hz, one = np.inf if model.one_frequency else model.to_hz, model.one_frequency
     data = condense(found, alike=plain, response_hz=to_hz, one_frequency=one, powers=model.powers)
-    across = 0.0 if plain else _motion_across(data)
+    across = 0.0 if plain else _motion_across(found)
     if across <= MORE_ACROSS * priors.transverse:
         across = 0.0
     else:
@@ -227,17 +228,26 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     )
 
 
-def _motion_across(data: Condensed) -> float:
-    """The rms of motion across a uniaxial reference that the sensor shows along an axis, over that of the motion; 0
-    where what the motion leaves of the outputs is much alike, as noise is. The part of it that follows the motion looks
-    like S, and is about as large."""
-    if own_channels(data.channels) != 1:
-        return 0.0
-    rest = data.type_a.noise**2
-    power = data.slopes[:, 0] ** 2 @ np.ones(3) / data.count
-    beyond = np.where(rest.max(axis=1) > NOISIER_AXIS * rest.min(axis=1), np.ptp(rest, axis=1), 0.0)
-    total = float(data.count @ power)
-    return float(np.sqrt(data.count @ beyond / total)) if total > 0.0 else 0.0
+def _motion_across(windows: Sequence[Excitation]) -> float:
+    """The rms of motion across a uniaxial reference that the sensor shows along an axis, over that of the motion. The
+    part of it that follows the motion looks like S, and is about as large.
+
+    It is what the motion leaves of the outputs in the bands that move, beyond what it leaves of the output that moves
+    most: there, noise of the reference shows as well, and a response. 0 where that is not much more in most of these
+    bands: hum and other lines are in few.
+    """
+    power = beyond = 0.0
+    for bands in (w.bands for w in windows if len(w.live) == 1 and w.live.all()):
+        if bands is None:
+            continue
+        own = Factors(bands, np.arange(len(bands.points)))
+        moved = own.told.sum(axis=1)
+        moved = np.where(moved > LEAST_SHARE * moved.max(initial=0.0), moved, 0.0)
+        power += float(moved.sum())
+        along, most = own.left[:, int(np.argmax(own.told.sum(axis=0)))], own.left.max(axis=1)
+        if moved[most > NOISIER_AXIS * along].sum() > 0.5 * moved.sum():
+            beyond += float((most - along)[moved > 0.0].sum())
+    return float(np.sqrt(beyond / power)) if power > 0.0 else 0.0
 
 
 def _response(
