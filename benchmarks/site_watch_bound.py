@@ -52,7 +52,7 @@ def uncertainties(watch: SiteWatch, days: int) -> Iterator[Array]:
     before = min(begin - steps.begins[0], verdicts.LONGEST_DAYS)
     walk = verdicts.WALK_PER_ROOT_DAY * np.sqrt(np.array([(watch.day - begin + 1 + before) / 3.0]))
     one, none = np.ones_like(dependent), np.zeros(1)
-    misfit = (verdicts.MISFIT * verdicts.limit_of(8, GATEWAYS[8])) ** 2 * dependent
+    misfit = verdicts.misfit_of(verdicts.limit_of(8, GATEWAYS[8])) ** 2 * dependent
     for info, inflation, walked in (
         (known, one, none), (learned_days / of_day, one, none), (own, one, none), (own, dependent, none),
         (own, misfit, none), (own, misfit, walk),
