@@ -35,18 +35,14 @@ def motion_numbers(
 
 def _in_band(basis: Array, V: Array, rate_hz: float, noise: Array) -> tuple[dict[str, float], float]:
     """Level of the reference, its `noise` (m,) and the coherence, after averages that leave most of the motion; and the
-    largest sensitivity of V to it, in output unit per m/s2. Beside a uniaxial reference the coherence is that of V
-    along the slopes."""
+    largest sensitivity of V to it, in output unit per m/s2."""
     m = len(noise)
     u = basis[:, 1 : 1 + m]
     width = detection.band_width(u, rate_hz, noise)
     slow, slow_v = detection.averaged(basis, width), detection.averaged(V, width)
     solution, *_ = np.linalg.lstsq(slow, slow_v, rcond=None)
-    moved, left = slow_v - slow_v.mean(axis=0), slow_v - slow @ solution
-    if m == 1:  # motion across, which a uniaxial reference does not measure, is no fault of the sensor
-        way = solution[1]
-        moved, left = moved @ way, left @ way
-    total, rest = float(np.sum(moved**2)), float(np.sum(left**2))
+    total = float(np.sum((slow_v - slow_v.mean(axis=0)) ** 2))
+    rest = float(np.sum((slow_v - slow @ solution) ** 2))
     numbers = {
         "reference_rms_mps2": float(np.sqrt(np.sum(np.var(slow[:, 1 : 1 + m], axis=0)))),
         # A constant channel has only rounding errors as level and as noise: it must count as silent.
