@@ -34,6 +34,7 @@ HANN_LINES = 2.0 / 3.0  # of the lines of a Hann window are independent
 LINES_TOGETHER = 16  # lines of a spectrum in which sensor and reference are related by one complex matrix
 RELATED = 1e-9  # relative eigenvalue of the sensor's channels below which they show nothing more
 CLIPPED_POINTS = 3  # fewer points with the same extreme value may occur by chance
+NEAR_END = 0.1  # of the range: values near its end
 DISTINCT = 0.99  # if this part of the points within the range differ, three points at an extreme are no chance
 ROUNDING = 1e-9  # of the range: smaller residuals are rounding errors, not noise
 
@@ -139,7 +140,8 @@ def clipped(V: Array, residual: Array, finest: Array) -> int:
     """Number of points of V (n, 3) that are clipped: several points have the same extreme value, and either the motion
     goes beyond that value, or hardly any two points within the range have the same value.
 
-    `residual` (n, 3) of V from its regression on the motion, `finest` (3,) the resolution of V.
+    `residual` (n, 3) of V from its regression on the motion, `finest` (3,) the resolution of V. The motion goes beyond
+    what it does at other values near the extreme one: a lag or a response makes all large values too small.
     """
     points = 0
     for axis in range(V.shape[1]):
@@ -149,7 +151,9 @@ def clipped(V: Array, residual: Array, finest: Array) -> int:
             if len(held) < CLIPPED_POINTS:
                 continue
             noise = 1.4826 * float(median(np.abs(r)))
-            if _all_differ(v, noise) or -sign * float(r[held].mean()) > noise + finest[axis]:
+            near = (sign * (end - v) < NEAR_END * np.ptp(v)) & (v != end)
+            inwards = max(-sign * float(r[near].mean()), 0.0) if near.any() else 0.0
+            if _all_differ(v, noise) or -sign * float(r[held].mean()) > inwards + noise + finest[axis]:
                 points += len(held)
     return points
 

@@ -17,7 +17,9 @@ TURNS = 4  # each iteration leaves about a thousandth of the lag
 BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the iterations lead to the lag
 # Limit of (omega lag)^3 / 6, the error of the window equations, which are of second order in the remaining lag.
 PHASE_LEFT = 1e-8
+SLOWEST = 0.25  # of the mean frequency of the motion: slower motion does not count in a correlation
 AS_HIGH = 0.9  # of the highest peak of a correlation: peaks of motion with one frequency differ by less
+HARDLY = 0.99  # of a correlation: with noise, the best rate of clocks in step is not exactly 0
 FINER = 4  # lags a sample: the fastest motion that resampling keeps turns by half a rad from one to the next
 SEGMENT_S = 2.0  # of samples that have one lag: a few cycles of the motion
 PIECE_S = 20.0  # of samples that are correlated at once: clocks that differ by 200 ppm change their lag by 4 ms
@@ -146,12 +148,13 @@ def correlated_lag(
     for time_s, V, u in islice((piece for part in parts for piece in _pieces(*part)), 0, None, every):
         step_s = step_s or float(median(np.diff(time_s))) / FINER
         middles.append(0.5 * (time_s[0] + time_s[-1]))
-        correlations.append(_correlation(V, u, int(np.ceil(reach_s / step_s)) + 1))
+        size = int(np.ceil(reach_s / step_s)) + 1
+        correlations.append(_correlation(V, u, size, SLOWEST * omega * step_s * FINER / (2.0 * np.pi)))
     if not middles:
         return None
     middles_s = np.array(middles)
     at_s, half_s = 0.5 * float(middles_s[0] + middles_s[-1]), 0.5 * float(np.ptp(middles_s))
-    finest = max(2.0 * FINER * step_s, np.pi / 4.0 / omega) / half_s if half_s else np.inf
+    finest = max(step_s, np.pi / 4.0 / omega) / half_s if half_s else np.inf
     number = int(min(np.ceil(most_rate / finest), MOST_RATES))
     rates = np.linspace(-most_rate, most_rate, 2 * number + 1) if number else np.zeros(1)
     shifts = np.rint(np.outer(rates, middles_s - at_s) / step_s).astype(int)
@@ -169,12 +172,15 @@ def _pieces(time_s: Array, V: Array, u: Array) -> Iterable[tuple[Array, Array, A
     return zip(*(np.array_split(x, number) for x in (time_s, V, u)), strict=True)
 
 
-def _correlation(V: Array, u: Array, size: int) -> Array:
+def _correlation(V: Array, u: Array, size: int, slowest: float) -> Array:
     """The squared correlation (2 size + 1,) of outputs and reference, at lags of -size to size steps of a sample over
-    FINER: between two samples the peak of fast motion would be too low."""
+    FINER: between two samples the peak of fast motion would be too low. What has less than `slowest` cycles a sample is
+    left out: beside turns against gravity, which are slow and large, all lags of the motion would look alike."""
     length = 1 << (len(V) + size // FINER).bit_length()
     out, moved = (np.fft.rfft(x - x.mean(axis=0), length, axis=0) for x in (V, u))
-    power = np.outer(*(np.var(x, axis=0) * len(x) for x in (V, u)))
+    slow = int(np.ceil(slowest * length))
+    out[:slow], moved[:slow] = 0.0, 0.0
+    power = np.outer(*(2.0 * np.sum(np.abs(x) ** 2, axis=0) / length for x in (out, moved)))
     both = FINER * np.fft.irfft(out[:, :, None] * moved[:, None, :].conj(), FINER * length, axis=0)
     both = np.concatenate([both[-size:], both[: size + 1]])
     return np.asarray(np.divide(both**2, power, out=np.zeros_like(both), where=power > 0.0).sum(axis=(1, 2)) * len(V))
@@ -188,7 +194,7 @@ def _slowest_peak(total: Array, rates: Array, step_s: float, at_s: float) -> tup
     along = np.maximum(around[1:-1, :-2], around[1:-1, 2:])
     across = np.maximum(around[:-2], around[2:])
     across = np.maximum(np.maximum(across[:, :-2], across[:, 2:]), across[:, 1:-1])
-    across[len(rates) // 2] = -np.inf  # clocks that do not run apart are always looked at
+    across[len(rates) // 2] *= HARDLY  # clocks do not run apart where that would be hardly better
     peaks = np.argwhere((total >= AS_HIGH * total.max()) & (total >= along) & (total >= across))
     lags = peaks[:, 1] - total.shape[1] // 2
     first = np.lexsort([np.abs(lags), np.abs(rates[peaks[:, 0]])])[0]

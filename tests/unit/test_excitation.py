@@ -141,6 +141,26 @@ def test_coarse_counts_are_not_clipped(step: float) -> None:
     assert only(motion_windows(POSE, quantised(points(noise=0.0, reference_noise=1e-6), step))).used
 
 
+def test_a_sweep_whose_residual_grows_with_the_motion_is_not_clipped() -> None:
+    """The largest values of a sweep with constant displacement come at its end, where a filter takes most of them."""
+    rate_hz, seconds = 200.0, 20.0
+    t = np.arange(round(rate_hz * seconds)) / rate_hz
+    times = 8.0 ** np.minimum(t / seconds, 0.9)  # the frequency over that at the beginning; its last 2 s are a tone
+    level = (times / times[-1]) ** 2
+    u = level * np.sin(2.0 * np.pi * 2.0 * np.cumsum(times) / rate_hz)
+    V = 3.0 * np.column_stack([0.02 * u, u, 0.1 * u]) * (1.0 - 0.05 * level)[:, None]
+    V += 0.003 * np.random.default_rng(4).standard_normal(V.shape)
+    V = np.round(V / 0.01) * 0.01
+    basis = np.column_stack([np.ones(len(t)), u, np.gradient(u, t)])
+    finest = detection.least_step(V)
+    assert (V[:, 1] == V[:, 1].max()).sum() >= 3
+    _, residual = detection.knocked(V, basis, finest)
+    assert detection.clipped(V, residual, finest) == 0
+    flat = np.minimum(V, [np.inf, 0.97 * V[:, 1].max(), np.inf])
+    _, residual = detection.knocked(flat, basis, finest)
+    assert detection.clipped(flat, residual, finest) > 3
+
+
 def dead(data: Points) -> Points:
     rng = np.random.default_rng(5)
     return data._replace(u=0.01 * rng.normal(size=data.u.shape), du=np.zeros_like(data.du))

@@ -136,6 +136,30 @@ def test_clocks_that_run_apart_are_found_by_correlation_without_holding_all_samp
     assert max(alive) <= 2
 
 
+@pytest.mark.parametrize("rate", [0.0, 6e-5])
+def test_beside_turns_against_gravity_clocks_that_run_apart_are_found(rate: float) -> None:
+    """Eight stays of 20 s, turned in each: gravity makes 20 times the motion, and is the same at all these lags."""
+    stay_s, stays, omega = 20.0, 8, 2.0 * np.pi * 20.0
+    gravity_mps2 = 9.81 * np.random.default_rng(3).standard_normal((stays + 1, 3))
+
+    def shown(time_s: np.ndarray, k: int) -> np.ndarray:
+        turned = 0.5 - 0.5 * np.cos(np.pi * np.clip((time_s / stay_s - k - 0.45) / 0.08, 0.0, 1.0))
+        turns = gravity_mps2[k] + turned[:, None] * (gravity_mps2[k + 1] - gravity_mps2[k])
+        return np.asarray(0.5 * motion(time_s, 3 * k, (12.0, 28.0)) + turns)
+
+    def parts() -> Iterator[tuple]:
+        for k in range(stays):
+            time_s = k * stay_s + np.arange(round(RATE_HZ * stay_s)) / RATE_HZ
+            yield time_s, shown(time_s - 0.01 - rate * (time_s - 80.0), k) @ S.T, shown(time_s, k)
+
+    told = correlated_lag(parts(), stays * stay_s, 0.12, 2e-4, omega)
+    assert told is not None
+    found_s, change, at_s = told
+    ends_s = np.array([0.0, stays * stay_s])
+    errors_s = found_s + change * (ends_s - at_s) - 0.01 - rate * (ends_s - 80.0)
+    assert np.abs(errors_s).max() < 0.125 * np.pi / omega + 0.25 / RATE_HZ  # a sixteenth of a period, and a quarter sample
+
+
 @pytest.mark.parametrize(
     ("upper", "lag_s", "noise_mps2", "bursts"), [(1.6, 0.017, 0.01, True), (3.0, 0.0125, 0.035, False)]
 )
