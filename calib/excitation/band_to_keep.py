@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from calib.excitation.detection import moving_share
 from calib.excitation.turning import feels_gravity
 from calib.model import Array
 from calib.signal.band import STOP_BAND, band_above_noise, noise_in_bands, power_share_above
@@ -26,14 +27,20 @@ def band_to_keep(
     rates_hz: tuple[float, float],
     widest_hz: Array,
     to_hz: float | None,
+    together: Array,
 ) -> tuple[float | None, Array]:
     """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left.
 
     `rates_hz`: of the reference and of the sensor. `widest_hz` (2,): the bands of the noise in u and du/dt that
-    interpolation leaves (calib.signal.resampling.Resampled). `to_hz` as in Settings.
+    interpolation leaves (calib.signal.resampling.Resampled). `to_hz` as in Settings. `together` (k, 3 + m): V and u at
+    the same times. What looks like white noise of the reference, and the sensor shows as well, is motion.
     """
     rate_hz, derivatives, m = rates_hz[0], instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
+    if found_hz is not None and len(together):
+        beyond_hz = found_hz, BAND * min(rates_hz)
+        moves = moving_share(together[:, 3:], together[:, :3], rates_hz[1], beyond_hz, derivatives)
+        density = density * np.sqrt(1.0 - moves)
     density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
     if derivatives:
         widest_hz = np.minimum(DIFFERENTIATED_BAND_HZ, widest_hz)

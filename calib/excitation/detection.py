@@ -33,6 +33,10 @@ SPECTRUM_SAMPLES, SPECTRA, FEWEST_FOR_SPECTRUM = 4096, 4, 16
 HANN_LINES = 2.0 / 3.0  # of the lines of a Hann window are independent
 LINES_TOGETHER = 16  # lines of a spectrum in which sensor and reference are related by one complex matrix
 RELATED = 1e-9  # relative eigenvalue of the sensor's channels below which they show nothing more
+# Least sensitivity of an axis over that of another one: a direction with less of it shows the noise of a reference that
+# does not move there, not a sensitivity.
+ALIKE = 0.3
+CLEAR = 4.0  # standard deviations of what independent noise shows by chance
 CLIPPED_POINTS = 3  # fewer points with the same extreme value may occur by chance
 NEAR_END = 0.1  # of the range: values near its end
 DISTINCT = 0.99  # if this part of the points within the range differ, three points at an extreme are no chance
@@ -201,6 +205,32 @@ def white_noise(x: Array) -> Array:
     power = median((lines.real**2 + lines.imag**2).reshape(len(lines), -1)) / np.sum(window**2)
     # The power of a line of white noise is exponentially distributed: its mean is its median divided by ln 2.
     return np.asarray(np.sqrt(power / np.log(2.0)))
+
+
+def moving_share(u: Array, V: Array, rate_hz: float, band_hz: tuple[float, float], derivatives: int) -> Array:
+    """How much (m,) of the power of a reference u (n, m) between two frequencies is motion: the sensor's V (n, 3) shows
+    it as well, with the sensitivity that it has for the whole motion, at any lag. From 0 to 1; 0 where it is not clear.
+
+    `derivatives`: how often the measured quantity was differentiated to give u; the power is that of the quantity.
+    """
+    m, (parts, window) = u.shape[1], spectral_parts(np.hstack([u, V]))
+    if parts is None:
+        return np.zeros(m)
+    at_hz = np.arange(parts.shape[2] // 2 + 1) * (rate_hz / parts.shape[2])
+    within = np.flatnonzero((at_hz >= band_hz[0]) & (at_hz <= band_hz[1]) & (at_hz > 0.0))
+    groups = len(within) // LINES_TOGETHER
+    within = within[: groups * LINES_TOGETHER]
+    lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., within] / at_hz[within] ** derivatives
+    rows = lines.reshape(len(lines), -1, groups, LINES_TOGETHER).transpose(2, 0, 1, 3).reshape(groups, len(lines), -1)
+    slopes, *_ = np.linalg.lstsq(u - u.mean(axis=0), V - V.mean(axis=0), rcond=None)
+    back = np.linalg.pinv(slopes, ALIKE)
+    own, seen = np.split(np.mean(np.abs(rows) ** 2, axis=2), [m], axis=1)
+    both = np.abs(np.einsum("gjl,gil,ij->gj", rows[:, :m].conj(), rows[:, m:], back)) / rows.shape[2]
+    # Of independent noise, the square of a mean product is that of both powers over the number of independent lines.
+    chance = own * (seen @ back**2) / (HANN_LINES * LINES_TOGETHER * min(parts.shape[1], len(u) / parts.shape[2]))
+    moved, power = np.sum(both**2 - chance, axis=0), np.sum(own**2, axis=0)
+    clear = moved > CLEAR * np.sqrt(np.sum(chance**2, axis=0))
+    return np.sqrt(np.clip(np.divide(moved, power, out=np.zeros(m), where=clear & (power > 0.0)), 0.0, 1.0))
 
 
 def incoherent(u: Array, V: Array) -> Array:
