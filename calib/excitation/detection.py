@@ -36,7 +36,7 @@ RELATED = 1e-9  # relative eigenvalue of the sensor's channels below which they 
 # Least sensitivity of an axis over that of another one: a direction with less of it shows the noise of a reference that
 # does not move there, not a sensitivity.
 ALIKE = 0.3
-CLEAR = 4.0  # standard deviations of what independent noise shows by chance
+CLEAR = 6.0  # standard deviations of what independent noise shows by chance
 CLIPPED_POINTS = 3  # fewer points with the same extreme value may occur by chance
 NEAR_END = 0.1  # of the range: values near its end
 DISTINCT = 0.99  # if this part of the points within the range differ, three points at an extreme are no chance
@@ -220,7 +220,9 @@ def moving_share(u: Array, V: Array, rate_hz: float, band_hz: tuple[float, float
     within = np.flatnonzero((at_hz >= band_hz[0]) & (at_hz <= band_hz[1]) & (at_hz > 0.0))
     groups = len(within) // LINES_TOGETHER
     within = within[: groups * LINES_TOGETHER]
-    lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., within] / at_hz[within] ** derivatives
+    lines = (
+        np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., within] / at_hz[within] ** derivatives
+    )
     rows = lines.reshape(len(lines), -1, groups, LINES_TOGETHER).transpose(2, 0, 1, 3).reshape(groups, len(lines), -1)
     slopes, *_ = np.linalg.lstsq(u - u.mean(axis=0), V - V.mean(axis=0), rcond=None)
     back = np.linalg.pinv(slopes, ALIKE)

@@ -157,7 +157,9 @@ def test_beside_turns_against_gravity_clocks_that_run_apart_are_found(rate: floa
     found_s, change, at_s = told
     ends_s = np.array([0.0, stays * stay_s])
     errors_s = found_s + change * (ends_s - at_s) - 0.01 - rate * (ends_s - 80.0)
-    assert np.abs(errors_s).max() < 0.125 * np.pi / omega + 0.25 / RATE_HZ  # a sixteenth of a period, and a quarter sample
+    assert (
+        np.abs(errors_s).max() < 0.125 * np.pi / omega + 0.25 / RATE_HZ
+    )  # a sixteenth of a period, and a quarter sample
 
 
 @pytest.mark.parametrize(
