@@ -1,0 +1,64 @@
+"""What looks like white noise of a reference may be motion: the sensor shows it as well, under noise of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib import calibrate
+from calib.excitation.detection import moving_share
+from calib.model import Array
+
+RATE_HZ, POINTS = 250.0, 15_000
+OWN_MPS2, SENSOR_MPS2 = 2e-3, 3e-3  # noise of the reference and of the sensor
+
+
+def band(random: np.random.Generator, low_hz: float, high_hz: float) -> Array:
+    """(n, 3) of rms 1."""
+    lines, at_hz = np.fft.rfft(random.standard_normal((POINTS, 3)), axis=0), np.fft.rfftfreq(POINTS, 1.0 / RATE_HZ)
+    lines[(at_hz < low_hz) | (at_hz > high_hz)] = 0.0
+    moved = np.fft.irfft(lines, POINTS, axis=0)
+    return np.asarray(moved / moved.std())
+
+
+def pair(seed: int, floor_mps2: float, own_mps2: float = OWN_MPS2) -> tuple[Array, Array, Array]:
+    """Reference and sensor (n, 3), and S. Modes below 10 Hz move x twenty times as much as z, and all axes move by
+    `floor_mps2` up to 120 Hz."""
+    random = np.random.default_rng([91, seed])
+    a = 0.1 * band(random, 1.0, 10.0) * [1.0, 0.5, 0.05] + floor_mps2 * band(random, 0.5, 120.0)
+    S = np.eye(3) + 0.02 * random.standard_normal((3, 3))
+    u = a + own_mps2 * random.standard_normal(a.shape)
+    return u, a @ S.T + SENSOR_MPS2 * random.standard_normal(a.shape), S
+
+
+@pytest.mark.parametrize("floor_mps2", [0.0, 0.003, 0.01])
+def test_the_share_of_a_floor_that_moves_is_found(floor_mps2: float) -> None:
+    motion, noise = floor_mps2**2 / 119.5, OWN_MPS2**2 / (0.5 * RATE_HZ)
+    found = np.array([moving_share(*pair(seed, floor_mps2)[:2], RATE_HZ, (15.0, 60.0), 0) for seed in range(12)])
+    if not floor_mps2:
+        assert not found.any()
+    np.testing.assert_allclose(found.mean(axis=0), motion / (motion + noise), atol=0.03)
+
+
+def test_a_direction_in_which_nothing_moves_shows_noise() -> None:
+    random = np.random.default_rng(5)
+    u = 0.1 * band(random, 1.0, 10.0) * [1.0, 0.0, 0.0]
+    V = u + SENSOR_MPS2 * random.standard_normal(u.shape)
+    u += OWN_MPS2 * random.standard_normal(u.shape)
+    assert not moving_share(u, V, RATE_HZ, (15.0, 60.0), 0).any()
+
+
+def test_a_weak_axis_beside_motion_of_all_frequencies_is_within_u() -> None:
+    """The floor is weaker than the sensor's noise. If it counted as noise of the reference, S_zz would be 1.7 % larger."""
+    errors = []
+    for seed in range(6):
+        u, V, S = pair(seed, 0.002, 5e-4)
+        u += [0.0, 0.0, 9.81]
+        V += 9.81 * S[:, 2]
+        time_s = np.arange(POINTS) / RATE_HZ
+        reference = {"time_s": time_s} | dict(zip(("ax", "ay", "az"), u.T, strict=True))
+        found = calibrate((time_s, V), reference, rotation=np.eye(3), reference_filter="flat", sensor_filter="flat")
+        assert found.status == "valid", found.reasons
+        errors.append((found.sensitivity[2, 2] - S[2, 2]) / found.standard_uncertainty.ravel()[8])
+    assert np.abs(errors).max() < 3.0
+    assert abs(np.mean(errors)) < 1.2  # of six, this has an SD of 0.4
