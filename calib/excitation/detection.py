@@ -218,12 +218,10 @@ def moving_share(u: Array, V: Array, rate_hz: float, band_hz: tuple[float, float
         return np.zeros(m)
     at_hz = np.arange(parts.shape[2] // 2 + 1) * (rate_hz / parts.shape[2])
     within = np.flatnonzero((at_hz >= band_hz[0]) & (at_hz <= band_hz[1]) & (at_hz > 0.0))
-    groups = len(within) // LINES_TOGETHER
-    within = within[: groups * LINES_TOGETHER]
-    lines = (
-        np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., within] / at_hz[within] ** derivatives
-    )
-    rows = lines.reshape(len(lines), -1, groups, LINES_TOGETHER).transpose(2, 0, 1, 3).reshape(groups, len(lines), -1)
+    if len(within) < LINES_TOGETHER:
+        return np.zeros(m)
+    lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., within]
+    rows = _in_groups(lines / at_hz[within] ** derivatives)
     slopes, *_ = np.linalg.lstsq(u - u.mean(axis=0), V - V.mean(axis=0), rcond=None)
     back = np.linalg.pinv(slopes, ALIKE)
     own, seen = np.split(np.mean(np.abs(rows) ** 2, axis=2), [m], axis=1)
@@ -232,7 +230,8 @@ def moving_share(u: Array, V: Array, rate_hz: float, band_hz: tuple[float, float
     chance = own * (seen @ back**2) / (HANN_LINES * LINES_TOGETHER * min(parts.shape[1], len(u) / parts.shape[2]))
     moved, power = np.sum(both**2 - chance, axis=0), np.sum(own**2, axis=0)
     clear = moved > CLEAR * np.sqrt(np.sum(chance**2, axis=0))
-    return np.sqrt(np.clip(np.divide(moved, power, out=np.zeros(m), where=clear & (power > 0.0)), 0.0, 1.0))
+    share = np.divide(moved, power, out=np.zeros(m), where=clear & (power > 0.0))
+    return np.asarray(np.sqrt(np.clip(share, 0.0, 1.0)))
 
 
 def incoherent(u: Array, V: Array) -> Array:
@@ -252,9 +251,7 @@ def incoherent_by_band(u: Array, V: Array) -> tuple[Array, Array] | None:
     if parts is None or parts.shape[2] < 4 * LINES_TOGETHER:
         return None
     m, lines = u.shape[1], np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., 1:-1]
-    groups = lines.shape[2] // LINES_TOGETHER
-    together = lines[..., : groups * LINES_TOGETHER].reshape(len(lines), -1, groups, LINES_TOGETHER)
-    rows = together.transpose(2, 0, 1, 3).reshape(groups, len(lines), -1)  # of each group, all its lines of a channel
+    rows = _in_groups(lines)
     cross = rows @ rows.conj().transpose(0, 2, 1)
     own, seen, both = cross[:, :m, :m], cross[:, m:, m:], cross[:, :m, m:]
     left = own - both @ np.linalg.pinv(seen, RELATED, hermitian=True) @ both.conj().transpose(0, 2, 1)
@@ -265,6 +262,13 @@ def incoherent_by_band(u: Array, V: Array) -> tuple[Array, Array] | None:
     unit = 2.0 / (segments * size * np.sum(window**2))
     power, alone = (unit * np.diagonal(of, axis1=1, axis2=2).real for of in (own, left))
     return np.asarray(independent / (independent - V.shape[1]) * alone), np.asarray(power)
+
+
+def _in_groups(lines: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """(G, m, -1) of each group of LINES_TOGETHER neighbours among lines (m, parts, k) all that a channel has."""
+    groups = lines.shape[2] // LINES_TOGETHER
+    together = lines[..., : groups * LINES_TOGETHER].reshape(len(lines), -1, groups, LINES_TOGETHER)
+    return together.transpose(2, 0, 1, 3).reshape(groups, len(lines), -1)
 
 
 def spectral_parts(x: Array) -> tuple[Array | None, Array]:

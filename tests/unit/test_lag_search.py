@@ -159,7 +159,7 @@ def test_beside_turns_against_gravity_clocks_that_run_apart_are_found(rate: floa
     errors_s = found_s + change * (ends_s - at_s) - 0.01 - rate * (ends_s - 80.0)
     assert (
         np.abs(errors_s).max() < 0.125 * np.pi / omega + 0.25 / RATE_HZ
-    )  # a sixteenth of a period, and a quarter sample
+    )  # of a period a sixteenth, of a sample a quarter
 
 
 @pytest.mark.parametrize(
