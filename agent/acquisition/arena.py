@@ -17,3 +17,14 @@ def one_arena() -> None:
     """
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
+
+
+def return_free() -> None:
+    """Return to the system all memory that this process has freed, also between blocks that it uses.
+
+    A solution of all records allocates tens of MB of small arrays. Without this call the holes between those that stay
+    are kept, and differ after each solution, so that the process grows: by 42 MB after 1,000 windows. It takes 0.1 to
+    1 ms.
+    """
+    with contextlib.suppress(AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)

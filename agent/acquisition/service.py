@@ -11,14 +11,14 @@ from functools import partial
 from pathlib import Path
 
 from agent import __version__
-from agent.acquisition.arena import one_arena
+from agent.acquisition.arena import one_arena, return_free
 from agent.acquisition.reader import EventQueue, Reader, reader_of
 from agent.acquisition.stalls import few_objects
 from agent.acquisition.weighing import Weighing
 from agent.audit.recalling import memories_of
 from agent.commanding.reception import Reception
 from agent.config import Channel, Config
-from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick
+from agent.core.events import Acceleration, DeviceChange, Event, Result, RunStart, Tick, WindowReport
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
 from agent.delivery.gateway_key import GatewayKey
@@ -274,6 +274,8 @@ class Service:
                 if isinstance(item, Acceleration):
                     self._publisher.stream(item.sensor, encode_acceleration(self._sequence, item))
         self._supervisor.on_event(event, results)
+        if any(isinstance(result, WindowReport) for result in results):
+            return_free()
 
     def _deliver(
         self, event_sequence: int, results: Sequence[Result], recorded: bool, memories: Sequence[Memory]

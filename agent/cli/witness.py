@@ -23,7 +23,7 @@ from agent.config.known_keys import KnownKeys, WatchedKeys
 from agent.delivery.ending import StopRequest
 from agent.delivery.hearing import Hearing
 from agent.delivery.keys import PREFIX, parse_key
-from agent.delivery.session import EndpointError, close_in_time, closed_in_time, session_config
+from agent.delivery.session import EndpointError, closed_in_time, session_config
 from agent.keys.files import write_new
 from agent.recording.signing import Signer, load_public_key
 from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
@@ -83,8 +83,7 @@ def witness(
     except zenoh.ZError:
         say(f"fieldcal witness: no Zenoh router answers at {', '.join(endpoints)}", err=True)
         return 1
-    with closed_in_time(session):
-        return _follow(session, key, kept, stop)
+    return _follow(session, key, kept, stop)
 
 
 def _keys(public_keys: Sequence[Path], known_keys: Path | None) -> Callable[[], KnownKeys] | None:
@@ -100,13 +99,6 @@ def _keys(public_keys: Sequence[Path], known_keys: Path | None) -> Callable[[], 
 
 
 def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) -> int:
-    subscriber = declare_advanced_subscriber(
-        session,
-        key,
-        zenoh.handlers.RingChannel(INBOX),
-        history=HistoryConfig(detect_late_publishers=True),
-        recovery=RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
-    )
     faults: list[OSError] = []
 
     def take_all() -> None:
@@ -116,7 +108,21 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) 
             faults.append(error)
             stop.set()
 
-    heard = _until_lost(session, key, take_all, subscriber, stop)
+    thread = threading.Thread(target=take_all, name="witness", daemon=True)
+    # Closing the session ends the subscription. The subscriber's `undeclare` would hold the lock of the interpreter
+    # while it waits for Zenoh.
+    with closed_in_time(session):
+        subscriber = declare_advanced_subscriber(
+            session,
+            key,
+            zenoh.handlers.RingChannel(INBOX),
+            history=HistoryConfig(detect_late_publishers=True),
+            recovery=RecoveryConfig(heartbeat=True),  # type: ignore[call-arg]
+        )
+        thread.start()
+        say(f"keeping the heads of {key}")
+        heard = _until_lost(session, stop)
+    thread.join(CLOSE_S)
     if not heard:
         say("fieldcal witness: the router does not answer any more; start this command again", err=True)
     for fault in faults:
@@ -143,22 +149,14 @@ def _take_all(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
             say(said)
 
 
-def _until_lost(
-    session: zenoh.Session, key: str, take_all: Callable[[], None], subscriber: AdvancedSubscriber[Any],
-    stop: StopRequest,
-) -> bool:  # fmt: skip
-    """Take heads in a thread until `stop` is set, or the router does not answer any more; returns whether it does."""
-    thread = threading.Thread(target=take_all, name="witness", daemon=True)
-    thread.start()
-    say(f"keeping the heads of {key}")
+def _until_lost(session: zenoh.Session, stop: StopRequest) -> bool:
+    """Wait until `stop` is set, or the router does not answer any more; returns whether it does."""
     hearing = Hearing()
     hearing.begin(session)
-    heard = True
-    while heard and not stop.wait(LOOK_S):
-        heard = not hearing.lost()
-    close_in_time(subscriber.undeclare)
-    thread.join(CLOSE_S)
-    return heard
+    while not stop.wait(LOOK_S):
+        if hearing.lost():
+            return False
+    return True
 
 
 def _signer(directory: Path) -> Signer:

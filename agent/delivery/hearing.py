@@ -22,6 +22,7 @@ LONGEST_S = 3600.0  # s; at most so long from a new session to its first questio
 # s to wait for an answer. Longer than 10 s, after which Zenoh gives a link up that shows no sign of life: a router that
 # stands still loses its links by itself, and one that is slow because all gateways come back gets no more work.
 ANSWER_S = 30.0
+REPLIES_MAX = 16  # that wait to be taken; each router gives one at most
 MISSES = 2  # questions in a row without answer: the first may have been lost with a link that was then replaced
 
 _log = logging.getLogger(__name__)
@@ -60,7 +61,7 @@ class Hearing:
             return False
         if self._question is None:
             self._question = _Question(self._session)
-        if not self._question.ended:
+        if not self._question.ended():
             return False
         answered, self._question = self._question.answered, None
         self._misses = 0 if answered else self._misses + 1
@@ -80,16 +81,20 @@ class Hearing:
 
 
 class _Question:
-    """Asked when it is made. `ended`, and then `answered`, are set by a thread of Zenoh."""
+    """Asked when it is made. `answered`: False where the time was over; it holds once the question has `ended`."""
 
     def __init__(self, session: zenoh.Session) -> None:
-        self.answered, self.ended = True, False
-        handler = zenoh.handlers.Callback(self._take, self._end, indirect=False)
-        session.liveliness().get(NOBODY, handler, timeout=ANSWER_S)
+        self.answered = True
+        # No callback: Zenoh 1.10 ends the answer to such a question while it holds a lock of the session. The end of a
+        # callback would there wait for the lock of the interpreter, which a thread that waits for Zenoh may hold.
+        self._replies = session.liveliness().get(NOBODY, zenoh.handlers.FifoChannel(REPLIES_MAX), timeout=ANSWER_S)
 
-    def _take(self, reply: zenoh.Reply) -> None:
-        if reply.ok is None:  # that the time is over
-            self.answered = False
-
-    def _end(self) -> None:
-        self.ended = True
+    def ended(self) -> bool:
+        """Whether the answer is complete."""
+        try:
+            while (reply := self._replies.try_recv()) is not None:
+                if reply.ok is None:  # that the time is over
+                    self.answered = False
+        except zenoh.ZError:  # no reply will come any more
+            return True
+        return False

@@ -196,8 +196,9 @@ class Publisher:
                 self._serve_more(session, open_things)
             for key in (f"{self._key}/alive", f"{self._key}/alive/{self._instance}"):
                 open_things.callback(session.liveliness().declare_token(key).undeclare)
-            # Before the session closes, otherwise Zenoh leaks the memory of the publishers.
-            open_things.callback(self._undeclare_publishers)
+            # Before the session closes, otherwise Zenoh leaks the memory of the publishers. Deleting an advanced one
+            # undeclares it without the lock of the interpreter; its `undeclare` holds that while it waits for locks.
+            open_things.callback(self._publishers.clear)
             self._hearing.begin(session)
             for record in history.latest():
                 if record.sequence <= self._store.published():
@@ -281,10 +282,6 @@ class Publisher:
                 publisher_detection=True,
             )
         return self._publishers[key]
-
-    def _undeclare_publishers(self) -> None:
-        while self._publishers:
-            self._publishers.popitem()[1].undeclare()
 
     def _fail(self, fault: str) -> None:
         if fault != self._said:

@@ -1,4 +1,4 @@
-"""One arena for all threads: counted by glibc itself, in a process of its own."""
+"""One arena for all threads, and what is free goes back: counted by glibc and the kernel, in processes of their own."""
 
 from __future__ import annotations
 
@@ -40,3 +40,32 @@ def test_threads_share_one_arena(tmp_path: Path, first: str, one: bool) -> None:
     told = tmp_path / "arenas.xml"
     subprocess.run([sys.executable, "-c", MANY.format(first=first, told=bytes(told))], check=True)
     assert (told.read_text().count("<heap nr=") == 1) is one
+
+
+FREED = """
+import ctypes, os
+from agent.acquisition.arena import one_arena, return_free
+libc = ctypes.CDLL(None)
+libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+one_arena()
+before = resident()
+blocks = [libc.malloc(20_000) for _ in range(2000)]
+for block in blocks:
+    ctypes.memset(block, 1, 20_000)
+for k, block in enumerate(blocks):
+    if k % 100 != 99:  # the last one stays, so that the end of the heap is in use
+        libc.free(block)
+full = resident()
+return_free()
+print(full - before, resident() - before)
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="only glibc keeps holes and can return them")
+def test_memory_between_blocks_in_use_goes_back_to_the_system() -> None:
+    told = subprocess.run([sys.executable, "-c", FREED], check=True, stdout=subprocess.PIPE, text=True).stdout
+    full_mb, left_mb = map(float, told.split())
+    assert full_mb > 38.0
+    assert left_mb < 3.0
