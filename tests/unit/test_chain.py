@@ -23,7 +23,7 @@ class Drawn:
         for k in range(EPOCHS - 1):
             follows = np.eye(N) + 0.2 * random.normal(size=(N, N))
             gap, noise = random.normal(size=N), random.normal(size=(N, CHANGES))
-            self.passages.append(Passage(np.linalg.inv(follows).astype(float), gap, noise))
+            self.passages.append(Passage.of(np.linalg.inv(follows).astype(float), gap, noise))
             moved = follows @ self.maps[-1]
             moved[:, N + k * CHANGES : N + (k + 1) * CHANGES] += noise
             self.maps.append(moved)
