@@ -15,17 +15,52 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Passage:
-    """From an epoch to the next: `back` (N, N) is the inverse of F, `gap` (N,), `noise` G (N, J)."""
+class NearIdentity:
+    """A matrix (`size`, `size`) of which only the elements are kept that are not those of the identity: `values` (n,)
+    at the places `at` (n,) of its rows one after the other. Hundreds of epochs would take tens of MB otherwise."""
 
-    back: Array
+    size: int
+    at: NDArray[np.intp]
+    values: Array
+
+    @classmethod
+    def of(cls, matrix: Array) -> NearIdentity:
+        """That of a matrix; a zero keeps its sign."""
+        other = np.ascontiguousarray(matrix).view(np.int64) != np.eye(len(matrix)).view(np.int64)
+        at = np.flatnonzero(other)
+        return cls(len(matrix), at, matrix.ravel()[at])
+
+    @property
+    def whole(self) -> Array:
+        """The matrix, bit for bit."""
+        found = np.eye(self.size)
+        found.ravel()[self.at] = self.values
+        return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passage:
+    """From an epoch to the next: `returns` (N, N) is the inverse of F, `gap` (N,), `noise` G (N, J)."""
+
+    returns: NearIdentity
     gap: Array
     noise: Array
+
+    @classmethod
+    def of(cls, back: Array, gap: Array, noise: Array) -> Passage:
+        """That of the whole matrix `back` (N, N)."""
+        return cls(NearIdentity.of(back), gap, noise)
+
+    @property
+    def back(self) -> Array:
+        """(N, N) the inverse of F."""
+        return self.returns.whole
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +91,8 @@ def passed(root: Array, passage: Passage, rows: Array | None = None) -> tuple[Ar
     if rows is not None:
         wide[j + size :, j:] = rows
     triangle = np.asarray(np.linalg.qr(wide, mode="r"))
-    link = EpochLink(triangle[:j, :j], triangle[:j, j:-1], triangle[:j, -1], passage)
+    # Copies, since a view would keep the whole triangle as long as the link.
+    link = EpochLink(triangle[:j, :j].copy(), triangle[:j, j:-1].copy(), triangle[:j, -1].copy(), passage)
     return triangle[j : j + size, j:], link
 
 
@@ -83,9 +119,8 @@ def backward(root: Array, links: Sequence[EpochLink]) -> Array:
     d[-1] = last
     for k in range(len(links) - 1, -1, -1):
         link, p = links[k], links[k].passage
-        inverse = np.linalg.inv(link.own)
-        back = p.back @ p.noise
-        d[k] = p.back @ (d[k + 1] - p.gap) - back @ (inverse @ (link.z - link.next @ d[k + 1]))
+        inverse, back = np.linalg.inv(link.own), p.back
+        d[k] = back @ (d[k + 1] - p.gap) - back @ p.noise @ (inverse @ (link.z - link.next @ d[k + 1]))
     return d
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from calib.distributions import coverage_factor
-from calib.estimate.chain import EpochLink, Passage, gains, passed, returned, solved
+from calib.estimate.chain import EpochLink, NearIdentity, Passage, gains, passed, returned, solved
 from calib.estimate.gauss_newton import Linearised, gauss_newton
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.physics import SIZE, STEP, Stack, Windows
@@ -129,7 +129,7 @@ class Now:
         if not (changes := self.unknowns.stepped(u)):
             return self
         size = len(self)
-        root, _ = passed(self.root, Passage(np.eye(size), np.zeros(size), np.array(changes).T))
+        root, _ = passed(self.root, Passage.of(np.eye(size), np.zeros(size), np.array(changes).T))
         return replace(self, root=root)
 
     def rows(self, record: Record, at: Array | None = None) -> Array:
@@ -338,7 +338,11 @@ class _Passes:
     ) -> None:
         self.unknowns, self.records, self.days, self.noise, self.seen_degc = unknowns, records, days, noise, seen_degc
         self.epoch_of = np.searchsorted(days, [r.day for r in records])
-        self.passages = [unknowns.passage(a, b) for a, b in zip(days.tolist(), days.tolist()[1:], strict=False)]
+        self.passages = [
+            (NearIdentity.of(follows), shift, passage)
+            for a, b in zip(days.tolist(), days.tolist()[1:], strict=False)
+            for follows, shift, passage in [unknowns.passage(a, b)]
+        ]
         self.mean, self.u = unknowns.prior
         self._segments = self._between_steps()
         self._rows, self.by_record = self._made(self.mean), list[Array]()
@@ -383,7 +387,7 @@ class _Passes:
             return np.tile(first, (len(self.days), 1))
         x = [first]
         for follows, shift, _ in self.passages:
-            x.append(follows @ x[-1] + shift)
+            x.append(follows.whole @ x[-1] + shift)
         return np.array(x)
 
     def lines_at(self, x: Array) -> Linearised:
@@ -392,7 +396,7 @@ class _Passes:
             self._rows = self._made(x[-1])
         around, size = self.around(x), len(self.unknowns)
         self.by_record = self._rows.at(x[self.epoch_of], around[self.epoch_of]) if self.records else []
-        by_epoch: list[list[Array]] = [[np.zeros((0, size + 1))] for _ in self.days]
+        by_epoch: list[list[Array]] = [[] for _ in self.days]
         for own, k in zip(self.by_record, self.epoch_of.tolist(), strict=True):
             by_epoch[k].append(own)
         for stated in self.unknowns.statements.dated:
@@ -402,10 +406,12 @@ class _Passes:
         root[range(size), range(size)] = 1.0 / self.u
         root[:, -1] = (self.mean - x[0]) / self.u
         passages = [
-            replace(passage, gap=follows @ before + shift - after)
+            replace(passage, gap=follows.whole @ before + shift - after)
             for (follows, shift, passage), before, after in zip(self.passages, x, x[1:], strict=False)
         ]
-        return Linearised(root, [np.vstack(parts) for parts in by_epoch], passages)
+        none = np.zeros((0, size + 1))
+        rows = [parts[0] if len(parts) == 1 else np.vstack([none, *parts]) for parts in by_epoch]
+        return Linearised(root, rows, passages)
 
     def solved(self, start: Now | None) -> Estimate:
         """The estimate, from the passes of Gauss-Newton."""

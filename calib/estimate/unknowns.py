@@ -240,7 +240,7 @@ class Unknowns:
         noises += self.stepped(_widened(s.widened, before, after))
         noise = np.array(noises).reshape(-1, size).T
         back = np.asarray(np.linalg.inv(follows), dtype=np.float64)
-        return follows, shift, Passage(back, np.zeros(size), noise)
+        return follows, shift, Passage.of(back, np.zeros(size), noise)
 
     def _centre(self, quantity: Quantity) -> int | None:
         return None if quantity.kind.since_certificate else self.at.get(replace(quantity, centre=True).key)

@@ -256,8 +256,8 @@ def _returned(root: Array, passage: Passage) -> tuple[Array, float]:
 
 def _with_constants(passage: Passage, many: int) -> Passage:
     """A passage with so many unknowns more, which do not change."""
-    size = len(passage.back)
+    size = len(passage.gap)
     back = np.eye(size + many)
     back[:size, :size] = passage.back
     noise = np.vstack([passage.noise, np.zeros((many, passage.noise.shape[1]))])
-    return Passage(back, np.append(passage.gap, np.zeros(many)), noise)
+    return Passage.of(back, np.append(passage.gap, np.zeros(many)), noise)

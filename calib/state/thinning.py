@@ -22,7 +22,9 @@ from calib.windows.record import TERMS, TOLD, Record
 NEWEST = 48  # records that stay as they are: four times round twelve positions
 # (age in days from which on, width in days): an hour for two weeks, then longer ones.
 WIDTHS = ((0.0, 1.0 / 24.0), (14.0, 1.0), (60.0, 7.0), (400.0, 14.0), (1200.0, 20.0))
-MOST = 650  # records: 2 MB with three axes of a reference. Of many positions and references the widths are doubled
+# Records. Each takes at most 3.4 kB of the state with three axes of a DC-coupled reference, and more with an AC-coupled
+# one, whose integrals are channels too. Of many positions and references the widths are doubled.
+MOST = 650
 WIDEST = 4096.0  # times the widths
 BRIEF_DAYS = 1.0  # so long Q is the same at all temperatures of a record
 BIN_K = 5.0  # records whose temperatures differ by more stay apart: S may depend on it

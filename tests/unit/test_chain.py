@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.estimate.chain import Passage, backward, forward, passed, returned, solved, with_rows
+from calib.estimate.chain import NearIdentity, Passage, backward, forward, passed, returned, solved, with_rows
 
 N, EPOCHS, CHANGES, ROWS = 6, 9, 3, 4
 
@@ -23,7 +23,7 @@ class Drawn:
         for k in range(EPOCHS - 1):
             follows = np.eye(N) + 0.2 * random.normal(size=(N, N))
             gap, noise = random.normal(size=N), random.normal(size=(N, CHANGES))
-            self.passages.append(Passage(np.linalg.inv(follows).astype(float), gap, noise))
+            self.passages.append(Passage.of(np.linalg.inv(follows).astype(float), gap, noise))
             moved = follows @ self.maps[-1]
             moved[:, N + k * CHANGES : N + (k + 1) * CHANGES] += noise
             self.maps.append(moved)
@@ -71,3 +71,17 @@ def test_epoch_by_epoch_it_is_the_same_as_at_once() -> None:
     gram = root[:, :N].T @ root[:, :N]
     np.testing.assert_allclose(gram, whole[:, :N].T @ whole[:, :N], rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(solved(root)[0], solved(whole)[0], rtol=0, atol=1e-10)
+
+
+def test_a_passage_keeps_what_differs_from_the_identity_bit_for_bit() -> None:
+    matrix = np.eye(40)
+    matrix[3, 7], matrix[5, 5], matrix[6, 1] = 1e-300, 0.0, -0.0
+    kept = NearIdentity.of(matrix)
+    assert kept.whole.tobytes() == matrix.tobytes()
+    assert len(kept.at) == len(kept.values) == 3
+
+
+def test_a_link_keeps_no_larger_array_alive() -> None:
+    drawn = Drawn(0)
+    for link in forward(drawn.prior, drawn.rows, drawn.passages)[1]:
+        assert link.own.base is link.next.base is link.z.base is None
