@@ -101,7 +101,7 @@ class SiteWatching:
         structure = self.told[site]["site"]
         if structure["verdict"] == "structure" and (before is None or before["site"]["verdict"] != "structure"):
             text = f"structure: {_what(structure)} since {structure['since']}"
-            self._fleet.note(site, "all", "structure", "watch", view.found.day * DAY_NS + DAY_NS, text, alarm=True)
+            self._fleet.note((site, "all", "structure"), "watch", view.found.day * DAY_NS + DAY_NS, text, alarm=True)
         keep_told(self._database.query, site, view.found.day, self.told[site])
         self._fleet.set_suspected(site, _suspicions(self.told[site]), view.found.day * DAY_NS + DAY_NS)
 
