@@ -15,7 +15,7 @@ from click.core import ParameterSource
 from numpy.typing import NDArray
 
 from agent.cli.rules import check_rules
-from agent.cli.simulate_fleet import fleet_options, serve_fleet
+from agent.cli.simulate_fleet import FleetOptions, fleet_options, serve_fleet
 from agent.delivery.ending import StopRequest
 from agent.terminal.text import say
 from hw.virtual.bench import Bench, Truth
@@ -80,7 +80,7 @@ def simulate(
         if of_a_track or {preset, directory, play, rate_hz, axes, link} != {None}:
             raise click.UsageError("--fleet goes with --connect, --sensors, --every, --speed, --age, --keys, "
                                    "--truth, --seed and --duration only")  # fmt: skip
-        return serve_fleet(seed=seed, duration_s=duration_s, **fleet)
+        return serve_fleet(FleetOptions(**fleet), seed, duration_s)
     check_rules(
         (
             not _given().isdisjoint(fleet),

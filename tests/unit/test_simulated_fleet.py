@@ -26,7 +26,7 @@ from agent.config.known_keys import add_key
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange
 from agent.delivery.consumer import Consumer, Received
 from agent.fleet import simulated_processes
-from agent.fleet.simulated import ODD, SimulatedFleet, behaviours
+from agent.fleet.simulated import ODD, FleetPlan, SimulatedFleet, behaviours
 from agent.fleet.simulated_processes import FleetProcesses
 from agent.fleet.simulated_sensor import BEGINS, Behaviour, SimulatedSensor, Story
 from tests.unit.zenoh_site import Site, taken_until, wait_for
@@ -47,7 +47,7 @@ def consumer_of(site: Site, fleet: SimulatedFleet, directory: Path) -> Iterator[
 
 def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
     site = Site()
-    with SimulatedFleet(4, 1, 1, [site.endpoint], tmp_path) as fleet:
+    with SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet:
         assert fleet.names_of("hostile")
         assert fleet.step(T_NS) > 0
         site.kill()
@@ -57,7 +57,7 @@ def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_every_result_arrives_once_in_order_and_signed_and_forged_ones_are_refused(site: Site, tmp_path: Path) -> None:
     with (
-        SimulatedFleet(4, 1, 1, [site.endpoint], tmp_path) as fleet,
+        SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet,
         consumer_of(site, fleet, tmp_path) as consumer,
     ):
         assert not fleet.unconnected
@@ -234,8 +234,8 @@ def test_a_fleet_in_several_processes_is_the_same_fleet(
 ) -> None:
     monkeypatch.setattr(simulated_processes, "GATEWAYS_EACH", 2)
     with (
-        SimulatedFleet(3, 1, 7, [site.endpoint], tmp_path / "one") as one,
-        FleetProcesses(3, 1, 7, [site.endpoint], tmp_path / "many") as many,
+        SimulatedFleet(FleetPlan(3, 1, 7, [site.endpoint], tmp_path / "one")) as one,
+        FleetProcesses(FleetPlan(3, 1, 7, [site.endpoint], tmp_path / "many")) as many,
     ):
         assert len(set(many.pids())) == 2
         assert sorted((g.name, g.behaviour, g.public_key) for g in many.gateways) == [
@@ -253,7 +253,7 @@ def test_a_fleet_in_several_processes_is_the_same_fleet(
 @pytest.mark.slow
 def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: Path) -> None:
     with (
-        SimulatedFleet(5, 1, 1, [site.endpoint], tmp_path) as fleet,
+        SimulatedFleet(FleetPlan(5, 1, 1, [site.endpoint], tmp_path)) as fleet,
         consumer_of(site, fleet, tmp_path) as consumer,
     ):
         fleet.step(T_NS, 0.5)
@@ -269,7 +269,7 @@ def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: P
 
 @pytest.mark.slow
 def test_a_process_that_ends_is_told(site: Site, tmp_path: Path) -> None:
-    with FleetProcesses(2, 1, 1, [site.endpoint], tmp_path) as fleet:
+    with FleetProcesses(FleetPlan(2, 1, 1, [site.endpoint], tmp_path)) as fleet:
         os.kill(fleet.pids()[0], signal.SIGKILL)
         with pytest.raises(BrokenProcessPool):
             fleet.step(T_NS)
