@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,19 +35,22 @@ from calib.visit.next_stop import MAIN, POWER, Suggestion, WantedUncertainty
 NAME_MAX = 63
 
 
+@dataclass(frozen=True)
+class Person:
+    """Who is led, at a terminal. `ask` gives the answer to a question, None at the end of input."""
+
+    ask: Callable[[str], str | None]
+    say: Callable[[str], None]
+    progress: Callable[[str], None]
+
+
 class BenchScreen:
-    """Says each thing to both. `publish` takes the guide, `ask`, `say` and `progress` are of the terminal."""
+    """Says each thing to both. `publish` takes the guide."""
 
     def __init__(
-        self,
-        sensor: str,
-        wanted: WantedUncertainty,
-        ask: Callable[[str], str | None],
-        say: Callable[[str], None],
-        progress: Callable[[str], None],
-        publish: Callable[[Guide], None],
+        self, sensor: str, wanted: WantedUncertainty, person: Person, publish: Callable[[Guide], None]
     ) -> None:
-        self._ask, self.say, self._progress, self._publish = ask, say, progress, publish
+        self._ask, self.say, self._progress, self._publish = person.ask, person.say, person.progress, publish
         self._stop = 1
         target = Expanded(100.0 * wanted.main, 100.0 * wanted.transverse)
         self._guide = Guide(t_utc_ns=0, sensor=sensor, stage="planning", wanted=target)

@@ -13,7 +13,7 @@ from agent.bench.capture import Capture
 from agent.bench.clamp_words import as_object, findings
 from agent.bench.dialogue import BEFORE_S, GAIN, SETTLED_S, STALE_S
 from agent.bench.measuring import StopInterval
-from agent.bench.screen import told_u
+from agent.bench.screen import Person, told_u
 from agent.bench.stops import BenchStop
 from agent.bench.visiting import Ahead, Visiting, VisitLook
 from calib.visit.clamping import Clamping
@@ -54,7 +54,7 @@ class Visited:
 
 
 class VisitDialogue:
-    """Leads one visit. `ask`, `say` and `progress` are as in agent.bench.dialogue.
+    """Leads one visit.
 
     `clamp` clamps a virtual reference as the answer says; None where a person does.
     """
@@ -64,13 +64,11 @@ class VisitDialogue:
         visiting: Visiting,
         capture: Capture,
         stay: VisitStay,
-        ask: Callable[[str], str | None],
-        say: Callable[[str], None],
-        progress: Callable[[str], None],
+        person: Person,
         clamp: Callable[[str], None] | None = None,
     ) -> None:
         self._visiting, self._capture, self._stay = visiting, capture, stay
-        self._ask, self._say, self._progress, self._clamp = ask, say, progress, clamp
+        self._ask, self._say, self._progress, self._clamp = person.ask, person.say, person.progress, clamp
         self._promised_s: float | None = None
         self._warned: set[str] = set()
 

@@ -6,7 +6,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -91,9 +91,9 @@ def bench(
     try:
         if config is None:
             with _virtual_bench(virtual, seed, routers) as (settings, turn):  # type: ignore[arg-type]
-                return _session(settings, settings.channels[0], output, options, turn)
+                return _session(_Bench(settings, settings.channels[0], output, options, turn))
         settings = load_config(config)
-        return _session(settings, _channel(settings, sensor, config), output, options, None)
+        return _session(_Bench(settings, _channel(settings, sensor, config), output, options, None))
     except ConfigError as error:
         for fault in error.faults:
             say(fault, err=True)
@@ -119,16 +119,27 @@ def _channel(settings: Config, sensor: str | None, path: Path) -> Channel:
     return found[0]
 
 
-def _session(settings: Config, channel: Channel, output: Path, options: dict[str, Any], turn: Turn | None) -> int:
-    if output.exists():
+@dataclass(frozen=True)
+class _Bench:
+    """What is calibrated, with which options, and where its files go. `turn` turns the sensor of a virtual bench."""
+
+    settings: Config
+    channel: Channel
+    output: Path
+    options: dict[str, Any]
+    turn: Turn | None
+
+
+def _session(bench: _Bench) -> int:
+    if bench.output.exists():
         raise FileExistsError
-    if options["stated"] is not None:
-        check_stated(options["stated"])
-    publisher = _publisher(settings)
+    if bench.options["stated"] is not None:
+        check_stated(bench.options["stated"])
+    publisher = _publisher(bench.settings)
     if publisher is None:
-        return _led(settings, channel, output, options, turn, lambda _: None)
+        return _led(bench, lambda _: None)
     with publisher:
-        return _led(settings, channel, output, options, turn, publisher.show)
+        return _led(bench, publisher.show)
 
 
 def _publisher(settings: Config) -> GuidePublisher | None:
@@ -149,28 +160,22 @@ def _publisher(settings: Config) -> GuidePublisher | None:
         return None
 
 
-def _led(
-    settings: Config,
-    channel: Channel,
-    output: Path,
-    options: dict[str, Any],
-    turn: Turn | None,
-    publish: Callable[[Guide], None],
-) -> int:
+def _led(bench: _Bench, publish: Callable[[Guide], None]) -> int:
     """Lead through the positions, and make the result."""
     from agent.bench.capture import Capture
     from agent.bench.kinds import stated, stops_of, write_prior
     from agent.bench.measuring import Measuring
-    from agent.bench.screen import BenchScreen
+    from agent.bench.screen import BenchScreen, Person
     from agent.calibrate.stated import options_of
     from calib.visit.next_stop import WantedUncertainty
 
+    channel, output, options = bench.channel, bench.output, bench.options
     stops = stops_of(channel, options["thetas"], options["alphas"])
     devices = [channel.sensor, *([channel.reference] if channel.reference else [])]
     wanted, status = WantedUncertainty(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0), 1
-    screen = BenchScreen(channel.sensor, wanted, ask, say, progress, publish)
+    screen = BenchScreen(channel.sensor, wanted, Person(ask, say, progress), publish)
     try:
-        with Capture(settings, devices) as capture:
+        with Capture(bench.settings, devices) as capture:
             info = opened(capture, devices)
             channel = with_filters(channel, capture)
             output.mkdir(parents=True)
@@ -179,7 +184,7 @@ def _led(
             told = parsed(arguments)
             measuring = Measuring(channel, options_of(told))
             session = _begun(stops, measuring, wanted, scale, capture)
-            if not _measured(session, measuring, capture, screen, output, options, turn, arguments):
+            if not _measured(bench, session, measuring, capture, screen, arguments):
                 (output / "prior.json").unlink()
                 output.rmdir()
                 say("no stop was taken, so there is no result", err=True)
@@ -205,29 +210,23 @@ def _begun(
 
 
 def _measured(
-    session: BenchSession,
-    measuring: Measuring,
-    capture: Capture,
-    screen: BenchScreen,
-    output: Path,
-    options: dict[str, Any],
-    turn: Turn | None,
+    bench: _Bench, session: BenchSession, measuring: Measuring, capture: Capture, screen: BenchScreen,
     arguments: list[str],
-) -> bool:
+) -> bool:  # fmt: skip
     """Whether stops were taken; their samples are then in the directory, also after Ctrl-C."""
     from agent.bench.aside import Aside
     from agent.bench.dialogue import Dialogue, StopStay
     from agent.bench.thinking import Thinking
 
-    stay = StopStay(options["stay_s"], max(options["most_s"], options["stay_s"]))
+    stay = StopStay(bench.options["stay_s"], max(bench.options["most_s"], bench.options["stay_s"]))
     with Aside() as aside:
-        dialogue = Dialogue(Thinking(session, measuring, aside), capture, stay, screen, turn)
+        dialogue = Dialogue(Thinking(session, measuring, aside), capture, stay, screen, bench.turn)
         try:
             dialogue.run()
         finally:
             if dialogue.taken:
                 time.sleep(measuring.margin_s)  # for the samples that filters need after a stop
-                measuring.write(capture.record(), dialogue.taken, output)
+                measuring.write(capture.record(), dialogue.taken, bench.output)
                 say("the samples are kept; the result is made by: fieldcal calibrate " + shlex.join(arguments))
     return bool(dialogue.taken)
 

@@ -142,6 +142,7 @@ def _visit(
     from agent.bench.capture import Capture
     from agent.bench.kinds import mounted, stated, write_prior
     from agent.bench.measuring import Measuring
+    from agent.bench.screen import Person
     from agent.bench.visit_dialogue import LEAST_STAY_S, VisitDialogue, VisitStay, forbidden
     from agent.bench.visiting import Visiting
     from agent.calibrate.stated import options_of
@@ -164,7 +165,7 @@ def _visit(
         stay_s = 60.0 * options["minutes"]
         dialogue = VisitDialogue(
             Visiting(measuring, wanted, aside), capture, VisitStay(min(LEAST_STAY_S, stay_s), stay_s),
-            _assent() if options["yes"] else partial(ask, err=options["apart"]), tell, progress,
+            Person(_assent() if options["yes"] else partial(ask, err=options["apart"]), tell, progress),
             None if clamp is None else partial(clamp, channel.sensor),
         )  # fmt: skip
         visited = dialogue.run(mounted(channel))
