@@ -34,7 +34,7 @@ from agent.delivery.schema import (
     write_states,
 )
 from agent.delivery.signed_states import Digests, StateList, digest_of
-from agent.delivery.states import Recall, no_memories, states_at_start
+from agent.delivery.states import Completeness, Recall, no_memories, states_at_start
 from agent.recording.continuation import UNKEPT_MAX
 
 # Results that a failing disk refused wait in memory for the next commit; beyond this number the oldest are dropped.
@@ -268,8 +268,9 @@ class Store:
             self.epoch = f"{epoch:016x}"
             directory = self.path.parent
             recovered = Recovered() if marks["clean"] else self._recover(everything=new)
-            behind = not marks["clean"] or bool(recovered.results)
-            found = states_at_start(self._connection, directory, recall, self._key, self.epoch, behind=behind, lost=new)
+            complete = bool(marks["clean"]) and not recovered.results
+            store_is: Completeness = "new" if new else "complete" if complete else "behind"
+            found = states_at_start(self._connection, directory, recall, self._key, self.epoch, store_is)
             if found.late and marks["clean"]:
                 recovered = self._recover(everything=False)
             recovered.memories = found.replayed
