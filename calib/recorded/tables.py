@@ -168,7 +168,7 @@ class Tables:
             found = [
                 w
                 for piece in self._pieces(interval)
-                for w in self._windows(interval, *piece, lag_s, response, floor, settings)
+                for w in self._windows(interval, piece, lag_s, response, floor, settings)
             ]
             windows += found or [_nothing(interval, "no samples of the sensor, or none of the reference, in this pose")]
             if progress is not None:
@@ -195,14 +195,13 @@ class Tables:
     def _windows(
         self,
         interval: PoseInterval,
-        start_s: float,
-        stop_s: float,
+        span_s: tuple[float, float],
         lag_s: float,
         response: Response,
         floor: Array | None,
         settings: Settings,
     ) -> list[Window]:
-        sensor, reference = self._cut(interval, start_s, stop_s, lag_s, response)
+        sensor, reference = self._cut(interval, *span_s, lag_s, response)
         if sensor is None or (reference is None and interval.pose.direction.shape[1]):
             return []
         try:
@@ -211,14 +210,14 @@ class Tables:
                 sensor,
                 reference,
                 self._instrument,
-                (start_s, stop_s),
+                span_s,
                 lag_s,
                 settings,
                 floor,
                 response,
             )
         except Unusable as error:
-            return [nothing_in(interval.pose, start_s, stop_s, str(error))]
+            return [nothing_in(interval.pose, *span_s, str(error))]
         return [replace(w, sums=with_joined(w.sums, self._joined)) for w in found]
 
     def _cut(
