@@ -59,13 +59,13 @@ def check_stated(path: Path) -> None:
 def made(options: dict[str, Any], output: Path, stated: Path | None) -> int:
     """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
     from agent.cli.calibrate import calibrate
-    from agent.cli.certificate import make
+    from agent.cli.certificate import CertificateOptions, make
 
     assert calibrate.callback is not None
     status = int(calibrate.callback(**options))
     if status or stated is None:
         return status
-    return make((output / "result.json",), output / "certificate", stated=stated)
+    return make((output / "result.json",), output / "certificate", CertificateOptions(stated=stated))
 
 
 def ask(prompt: str, *, err: bool = False) -> str | None:
