@@ -43,7 +43,7 @@ def dcc(c: ResultCertificate, signer: CertificateSigner) -> bytes:
         ET.register_namespace(prefix, space)
     root = ET.Element(_dcc("digitalCalibrationCertificate"), schemaVersion=VERSION)
     _administrative(_add(root, "administrativeData"), c)
-    _measured(_add(root, "measurementResults"), c)
+    _measurement(_add(root, "measurementResults"), c)
     ET.indent(root)
     body: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
     signed = signer.sign({"xml": body})
@@ -111,7 +111,7 @@ def _conformity(statements: ET.Element, c: ResultCertificate) -> None:
         _add(statement, "conformity", "pass" if verdict.conforms else "fail")
 
 
-def _measured(results: ET.Element, c: ResultCertificate) -> None:
+def _measurement(results: ET.Element, c: ResultCertificate) -> None:
     measured = _add(results, "measurementResult")
     _texts(measured, "name", "S and Q")
     method = _add(_add(measured, "usedMethods"), "usedMethod", refType="basic_calibrationMethod")
@@ -133,7 +133,7 @@ def _conditions(measured: ET.Element, c: ResultCertificate) -> None:
     kinds: list[tuple[str, str, Iterable[float] | None]] = [
         ("temperature", r"\degreecelsius", c.temperature_degc),
         ("band in which S holds", r"\hertz", c.result.frequencies.valid_band_hz),
-        ("frequency at which S holds", r"\hertz", _one(c.result.frequencies.reference_frequency_hz)),
+        ("frequency at which S holds", r"\hertz", _list_of_one(c.result.frequencies.reference_frequency_hz)),
         ("mean frequency of the motion", r"\hertz", c.frequency_hz or None),
         ("level of the motion, rms", UNITS["m/s²"], c.levels_mps2),
     ]
@@ -154,7 +154,7 @@ def _condition(conditions: ET.Element, name: str) -> ET.Element:
     return _add(condition, "data")
 
 
-def _one(value: float | None) -> list[float] | None:
+def _list_of_one(value: float | None) -> list[float] | None:
     return None if value is None else [value]
 
 

@@ -14,7 +14,15 @@ import click
 import numpy as np
 
 from agent.cli.finite import Finite
-from agent.cli.led import ask, check_stated, made, opened, parsed, progress, with_filters
+from agent.cli.leading import (
+    ask,
+    calibrate_options,
+    check_stated,
+    make_result,
+    progress,
+    wait_for_devices,
+    with_filters,
+)
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
 from agent.terminal.text import say
 
@@ -137,9 +145,9 @@ def _session(bench: _Bench) -> int:
         check_stated(bench.options["stated"])
     publisher = _publisher(bench.settings)
     if publisher is None:
-        return _led(bench, lambda _: None)
+        return _lead(bench, lambda _: None)
     with publisher:
-        return _led(bench, publisher.show)
+        return _lead(bench, publisher.show)
 
 
 def _publisher(settings: Config) -> GuidePublisher | None:
@@ -160,10 +168,10 @@ def _publisher(settings: Config) -> GuidePublisher | None:
         return None
 
 
-def _led(bench: _Bench, publish: Callable[[Guide], None]) -> int:
+def _lead(bench: _Bench, publish: Callable[[Guide], None]) -> int:
     """Lead through the positions, and make the result."""
     from agent.bench.capture import Capture
-    from agent.bench.kinds import stated, stops_of, write_prior
+    from agent.bench.kinds import stated_options, stops_of, write_prior
     from agent.bench.measuring import Measuring
     from agent.bench.screen import BenchScreen, Person
     from agent.calibrate.stated import options_of
@@ -176,27 +184,27 @@ def _led(bench: _Bench, publish: Callable[[Guide], None]) -> int:
     screen = BenchScreen(channel.sensor, wanted, Person(ask, say, progress), publish)
     try:
         with Capture(bench.settings, devices) as capture:
-            info = opened(capture, devices)
+            info = wait_for_devices(capture, devices)
             channel = with_filters(channel, capture)
             output.mkdir(parents=True)
             scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
-            arguments = [*stated(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
-            told = parsed(arguments)
+            arguments = [*stated_options(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
+            told = calibrate_options(arguments)
             measuring = Measuring(channel, options_of(told))
-            session = _begun(stops, measuring, wanted, scale, capture)
-            if not _measured(bench, session, measuring, capture, screen, arguments):
+            session = _begin(stops, measuring, wanted, scale, capture)
+            if not _measure(bench, session, measuring, capture, screen, arguments):
                 (output / "prior.json").unlink()
                 output.rmdir()
                 say("no stop was taken, so there is no result", err=True)
                 status = 3
                 return status
-        status = made(told, output, options["stated"])
+        status = make_result(told, output, options["stated"])
         return status
     finally:
-        screen.ended(output, status)
+        screen.show_end(output, status)
 
 
-def _begun(
+def _begin(
     stops: list[BenchStop], measuring: Measuring, wanted: WantedUncertainty, scale: float, capture: Capture
 ) -> BenchSession:
     """A session that knows how much the reference moves."""
@@ -209,7 +217,7 @@ def _begun(
     return BenchSession(stops, measuring.priors, wanted, scale, expected)
 
 
-def _measured(
+def _measure(
     bench: _Bench, session: BenchSession, measuring: Measuring, capture: Capture, screen: BenchScreen,
     arguments: list[str],
 ) -> bool:  # fmt: skip

@@ -88,13 +88,15 @@ def make(inputs: Sequence[Path], output: Path, options: CertificateOptions) -> i
         if len(material.results) > 1:
             raise MaterialError("a certificate is of one result; give one RESULT.json")
         if material.results[0].refused:
-            return _refused(material.results[0].reasons)
+            return _say_refusal(material.results[0].reasons)
         told, text = gather_statements(stated, options.entries, Interview())
         beside = Path() if stated is None else stated.parent
         written = write(certificate_of(material, told, beside, left_over(material)), output, private, options.xsd, x509)
-        written += _kept(text, output / "certificate.toml", stated)
+        written += _keep_statements(text, output / "certificate.toml", stated)
     except (ConfigError, KeyFileError, MaterialError, SchemaError, CertificateError, OSError) as error:
-        for line in _worded(error, f"{stated or '--state'}: " if isinstance(error, CertificateError) else "", output):
+        for line in _fault_lines(
+            error, f"{stated or '--state'}: " if isinstance(error, CertificateError) else "", output
+        ):
             say(f"fieldcal certificate: {line}", err=True)
         return 2
     for notice in material.notices:
@@ -104,13 +106,13 @@ def make(inputs: Sequence[Path], output: Path, options: CertificateOptions) -> i
     return 0
 
 
-def _refused(reasons: Sequence[str]) -> int:
+def _say_refusal(reasons: Sequence[str]) -> int:
     for reason in reasons:
         say(f"refused: {reason}", err=True)
     return 3
 
 
-def _worded(error: Exception, place: str, output: Path) -> list[str]:
+def _fault_lines(error: Exception, place: str, output: Path) -> list[str]:
     if isinstance(error, OSError):
         return [f"{error.filename or output}: {error.strerror}"]
     return [f"{place}{error}"] if place else str(error).splitlines()
@@ -127,7 +129,7 @@ def drawable() -> bool:
     return True
 
 
-def _kept(text: str, path: Path, stated: Path | None) -> list[Path]:
+def _keep_statements(text: str, path: Path, stated: Path | None) -> list[Path]:
     """Write the statements into the directory of the certificate, but not over the file that states the others."""
     if not text or (stated is not None and stated.resolve() == path.resolve()):
         return []

@@ -139,7 +139,7 @@ def _run(verb: Verb, given: dict[str, Any], options: _CommonOptions) -> int:
     files = options.tls.files(options.connect)
 
     def sealed(to: str) -> bytes:
-        return _sealed(key, to, options.sensor, verb, arguments, options.valid_s)
+        return _seal(key, to, options.sensor, verb, arguments, options.valid_s)
 
     if options.printed:
         say(as_line(sealed(_gateway_name(options.gateway))))
@@ -174,6 +174,6 @@ def _gateway_name(gateway: str | None) -> str:
     return gateway
 
 
-def _sealed(key: SigningKey, gateway: str, sensor: str, verb: Verb, arguments: Arguments, valid_s: float) -> bytes:
+def _seal(key: SigningKey, gateway: str, sensor: str, verb: Verb, arguments: Arguments, valid_s: float) -> bytes:
     now_ns = time.time_ns()
     return seal(Order.of(gateway, sensor, verb, arguments, now_ns, now_ns + int(valid_s * 1e9)), key.key_id, key.key)

@@ -109,7 +109,7 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) 
 
     def take_all() -> None:
         try:
-            _take_all(subscriber, kept)
+            _keep_heads(subscriber, kept)
         except OSError as error:
             faults.append(error)
             stop.set()
@@ -122,7 +122,7 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) 
     return 1 if faults or not heard else 0
 
 
-def _take_all(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
+def _keep_heads(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
     """Take each head that comes, and say which are not kept. Raises OSError where a disk fails that is not full."""
     refused, silent_until_s = 0, -math.inf
     for sample in subscriber:

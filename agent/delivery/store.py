@@ -120,7 +120,7 @@ class Store:
 
     def history(self) -> History:
         """Open a reader that gives only what the gateway's key signed. Use it in one thread. Raises StoreError."""
-        return History(self.path, self._key.known if self._key is not None else None)
+        return History(self.path, self._key.known_keys if self._key is not None else None)
 
     def find(self, sensor: str, what: str, sequence: int) -> StoredResult | None:
         """A result that is to come into force, as the gateway's key signed it; None where there is none.
@@ -238,7 +238,7 @@ class Store:
         write_mark(self._connection, "file", self._file_sequence)
 
     def _recover(self, *, everything: bool) -> Recovered:
-        keys = self._key.known if self._key is not None else None
+        keys = self._key.known_keys if self._key is not None else None
         return recover(self._connection, self.path.parent, keys, everything=everything)
 
     def _write_memories(self, memories: Iterable[Memory]) -> None:

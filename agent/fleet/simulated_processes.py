@@ -74,19 +74,21 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
 
     def step(self, t_utc_ns: int, within_s: float = 0.0) -> int:
         """As SimulatedFleet.step, in each process."""
-        return sum(self._each(_step, t_utc_ns, within_s))
+        return sum(self._in_each_process(_step, t_utc_ns, within_s))
 
     def last_sequence(self) -> dict[str, int]:
         """The number of the last result of each gateway, by its name."""
-        return {name: last for part in self._each(_last_sequence) for name, last in part.items()}
+        return {name: last for part in self._in_each_process(_last_sequence) for name, last in part.items()}
 
     def truth(self) -> list[dict[str, Any]]:
         """What is true of each gateway and its sensors now, by the names of the gateways."""
-        return sorted((gateway for part in self._each(_truth) for gateway in part), key=lambda told: told["gateway"])
+        return sorted(
+            (gateway for part in self._in_each_process(_truth) for gateway in part), key=lambda told: told["gateway"]
+        )
 
     def pids(self) -> list[int]:
         """Of its processes."""
-        return self._each(os.getpid)
+        return self._in_each_process(os.getpid)
 
     def names_of(self, behaviour: Behaviour) -> list[str]:
         """The gateways that behave so."""
@@ -105,7 +107,7 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
             for process in multiprocessing.active_children():
                 process.kill()
 
-    def _each(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
+    def _in_each_process(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
         """What the function gives in each process, where they run at the same time."""
         return [future.result() for future in [part.submit(what, *arguments) for part in self._parts]]
 

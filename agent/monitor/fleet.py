@@ -139,7 +139,7 @@ class Fleet:
             self._silent.discard(place)
             self.version += 1
             self._touch(place)
-        if told := _told_of(what, fields):
+        if told := _event_text(what, fields):
             self.note(place, what, fields["t_utc_ns"], told, alarm=fresh and _needs_a_person(what, fields))
 
     def recall(self, place: Place, verdicts: Sequence[dict[str, Any]]) -> None:
@@ -277,7 +277,7 @@ class Fleet:
             for gateway in changed:
                 self._touch_gateway(gateway)
 
-    def set_told(self, site: str, gateway: str, status: bytes) -> None:
+    def set_gateway_status(self, site: str, gateway: str, status: bytes) -> None:
         """What a gateway says of itself, as JSON; what is no such status is ignored."""
         if len(status) > LARGEST_TOLD:
             return
@@ -383,7 +383,7 @@ def _needs_a_person(what: str, fields: dict[str, Any]) -> bool:
     return what == "status" and fields["status"] in NEEDS_A_PERSON
 
 
-def _told_of(what: str, fields: dict[str, Any]) -> str:
+def _event_text(what: str, fields: dict[str, Any]) -> str:
     """What the list of events says of a result; "" where it is no event."""
     if what == "status":
         return f"{fields['status']}: {fields['reason']}"
@@ -473,7 +473,7 @@ class _Presence:
     retired: bool
 
 
-def _why(
+def _reasons(
     status: Mapping[str, Any], verdicts: Sequence[Mapping[str, Any]], presence: _Presence, suspicion: Suspicion | None
 ) -> list[str]:
     """Why the sensor is not sound, or is not heard."""
@@ -530,7 +530,7 @@ def _row(
         "last_good_utc_ns": newest.get("good window", {}).get("t_utc_ns"),
         "result_utc_ns": max(fields["t_utc_ns"] for fields in newest.values()),
         "verified": bool(newest) and all(fields.get("signed_by") for fields in newest.values()),
-        "why": "; ".join(clipped(reason) for reason in _why(status, verdicts, presence, suspicion)),
+        "why": "; ".join(clipped(reason) for reason in _reasons(status, verdicts, presence, suspicion)),
     }
 
 

@@ -73,7 +73,7 @@ def application(
             Route("/gateways.csv", access.reading(data.gateways_csv)),
             Route("/api/changes", access.reading_async(data.changes)),
             Route("/plan", access.reading(plans.picture)),
-            Route("/api/plan", access.reading(plans.told)),
+            Route("/api/plan", access.reading(plans.positions)),
             Route("/api/plan/picture", plans.put_picture, methods=["POST"]),
             Route("/api/plan/position", plans.put_position, methods=["POST"]),
             Route("/fleet.csv", access.reading(data.sensors_csv)),

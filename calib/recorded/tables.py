@@ -107,7 +107,7 @@ class Tables:
         settings = self._making.settings
         if not steady:
             settings = replace(settings, limits=settings.limits.unsteady)
-        found = self._made(settings, lag_s, response, progress)
+        found = self._make(settings, lag_s, response, progress)
         if not self._making.align or self._reference is None or self._phase_rad <= NEAR_RAD:
             return found
         if (told := drift(found)) is not None:
@@ -115,7 +115,7 @@ class Tables:
             if self._phase_rad <= BASIN_RAD and (told.significant if not self.rate else told.improves):
                 self._stretch(told.rate, told.time_s)
                 del found  # of a day, it would need as much memory once more
-                return self._made(settings, lag_s, response, progress)
+                return self._make(settings, lag_s, response, progress)
         return found
 
     @property
@@ -153,9 +153,9 @@ class Tables:
         """Windows that tell the response of each band by itself: no limit refuses what another response may explain,
         and no motion leaks from band to band."""
         settings = self._making.settings
-        return self._made(replace(settings, limits=settings.limits.of_any_response, taper=HANN), lag_s)
+        return self._make(replace(settings, limits=settings.limits.of_any_response, taper=HANN), lag_s)
 
-    def _made(
+    def _make(
         self,
         settings: Settings,
         lag_s: float,

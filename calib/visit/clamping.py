@@ -151,7 +151,9 @@ def _turned(regression: _Regression, R: Array, known: Array, covariance: Array) 
     slopes, inverse, residual, n, u, V = regression
     S, Q = known[:9].reshape(3, 3).copy(), known[9:].copy()
     # The start: the rotation nearest to S^-1 M, each direction weighted by the motion and by gravity.
-    seen = R.T @ np.linalg.solve(S, np.column_stack([slopes @ _root(inverse), V - Q if _known(covariance) else V]))
+    seen = R.T @ np.linalg.solve(
+        S, np.column_stack([slopes @ _root(inverse), V - Q if _offset_determined(covariance) else V])
+    )
     left, _, right = np.linalg.svd(seen @ np.column_stack([_root(inverse), u]).T)
     T = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     noise = np.zeros((12, 12))
@@ -178,7 +180,7 @@ def _turned(regression: _Regression, R: Array, known: Array, covariance: Array) 
     return np.asarray(Rotation.from_matrix(T).as_rotvec()), np.asarray(np.linalg.inv(information)[12:, 12:])
 
 
-def _known(covariance: Array) -> bool:
+def _offset_determined(covariance: Array) -> bool:
     """Whether Q is known so well that gravity tells a direction."""
     return bool(np.trace(covariance[9:, 9:]) < np.trace(covariance[:9, :9]) * 100.0)
 

@@ -126,7 +126,7 @@ def test_what_is_said_long_and_often_stays_within_the_message() -> None:
         screen.warn("knocks " * 100)
         screen.ask("question " * 100)
     screen.took(["x" * 100] * 150, np.full(9, 1e-3))
-    screen.ended(None, 3)
+    screen.show_end(None, 3)
     read = read_guide(msgspec.json.encode(shown[-1]), b"", GATEWAY, None)
     assert read == shown[-1]
     assert len(read.warnings) == guide_module.LINES_MAX

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 OPEN_S = 20.0  # for the devices to be opened and to send their first block
 
 
-def opened(capture: Capture, devices: list[str]) -> dict[str, Any]:
+def wait_for_devices(capture: Capture, devices: list[str]) -> dict[str, Any]:
     """What the sensor's driver read of it, when all devices send. Raises ValueError where one does not."""
     end = time.monotonic() + OPEN_S
     while time.monotonic() < end:
-        for line in capture.said():
+        for line in capture.messages():
             say(line, err=True)
         if all(capture.newest_s(device) is not None for device in devices):
             return dict(capture.info(devices[0]) or {})
@@ -40,7 +40,7 @@ def with_filters(channel: Channel, capture: Capture) -> Channel:
     return filters.channel
 
 
-def parsed(arguments: list[str]) -> dict[str, Any]:
+def calibrate_options(arguments: list[str]) -> dict[str, Any]:
     """The options of `fieldcal calibrate` by these arguments."""
     from agent.cli.calibrate import calibrate
 
@@ -56,7 +56,7 @@ def check_stated(path: Path) -> None:
     load_model(path, CertificateStatements)
 
 
-def made(options: dict[str, Any], output: Path, stated: Path | None) -> int:
+def make_result(options: dict[str, Any], output: Path, stated: Path | None) -> int:
     """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
     from agent.cli.calibrate import calibrate
     from agent.cli.certificate import CertificateOptions, make
