@@ -26,7 +26,7 @@ from agent.config.known_keys import add_key
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange
 from agent.delivery.consumer import Consumer, Received
 from agent.fleet import simulated_processes
-from agent.fleet.simulated import ODD, FleetPlan, SimulatedFleet, behaviours
+from agent.fleet.simulated import NEVER, ODD, FleetPlan, SimulatedFleet, SimulatedGateway, Stories, behaviours
 from agent.fleet.simulated_processes import FleetProcesses
 from agent.fleet.simulated_sensor import BEGINS, Behaviour, SimulatedSensor, Story
 from tests.unit.zenoh_site import Site, taken_until, wait_for
@@ -97,6 +97,15 @@ SOUND = ["UNCALIBRATED", "VALID"]
 
 
 @cache
+def test_a_silent_gateway_makes_no_more_results(tmp_path: Path) -> None:
+    gateway = SimulatedGateway(FleetPlan(1, 1, 1, [], tmp_path), 0, "silent", Stories(1).sensors(0, "silent", 1))
+    made = [gateway.step(T_NS + k * DAY_NS, NEVER) for k in range(BEGINS["silent"] + 2)]
+    gateway.close()
+    assert min(made[:-2]) > 0
+    assert made[-2:] == [0, 0]
+    assert gateway.truth()["since_utc_ns"] == T_NS + BEGINS["silent"] * DAY_NS
+
+
 def told(behaviour: Behaviour) -> tuple[list[Result], dict[str, Any]]:
     """The results of a sensor, and the truth at the end. Its gateway's results have numbers from 1001 on."""
     other, sensor = (
