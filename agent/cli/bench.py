@@ -20,6 +20,7 @@ from agent.cli.leading import (
     check_stated,
     make_result,
     progress,
+    say_fault,
     wait_for_devices,
     with_filters,
 )
@@ -102,18 +103,8 @@ def bench(
                 return _session(_Bench(settings, settings.channels[0], output, options, turn))
         settings = load_config(config)
         return _session(_Bench(settings, _channel(settings, sensor, config), output, options, None))
-    except ConfigError as error:
-        for fault in error.faults:
-            say(fault, err=True)
-        return 2
-    except ValueError as error:
-        say(f"fieldcal bench: {error}", err=True)
-        return 2
-    except FileExistsError:
-        say(f"fieldcal bench: {output} exists; name a new directory with -o", err=True)
-        return 2
-    except OSError as error:
-        say(f"fieldcal bench: {error.filename or output}: {error.strerror}", err=True)
+    except (ConfigError, ValueError, OSError) as error:
+        say_fault(error, "bench", output, "-o")
         return 2
 
 

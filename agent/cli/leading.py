@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agent.config.reading import ConfigError
 from agent.terminal.text import for_drawing, say
 
 if TYPE_CHECKING:
@@ -66,6 +67,19 @@ def make_result(options: dict[str, Any], output: Path, stated: Path | None) -> i
     if status or stated is None:
         return status
     return make((output / "result.json",), output / "certificate", CertificateOptions(stated=stated))
+
+
+def say_fault(error: Exception, command: str, directory: Path, option: str) -> None:
+    """Say what is wrong with the input. `directory`: of the results, which the `option` names; it must be new."""
+    if isinstance(error, ConfigError):
+        for fault in error.faults:
+            say(fault, err=True)
+    elif isinstance(error, FileExistsError):
+        say(f"fieldcal {command}: {directory} exists; name a new directory with {option}", err=True)
+    elif isinstance(error, OSError):
+        say(f"fieldcal {command}: {error.filename or directory}: {error.strerror}", err=True)
+    else:
+        say(f"fieldcal {command}: {error}", err=True)
 
 
 def ask(prompt: str, *, err: bool = False) -> str | None:

@@ -23,6 +23,7 @@ from agent.cli.leading import (
     check_stated,
     make_result,
     progress,
+    say_fault,
     wait_for_devices,
     with_filters,
 )
@@ -86,18 +87,8 @@ def visit(config: Path | None, sensors: tuple[str, ...], json_to: Path | None, s
         if json_to is not None:
             with click.open_file(str(json_to), "w") as file:
                 file.write(json.dumps(told) + "\n")
-    except ConfigError as error:
-        for fault in error.faults:
-            say(fault, err=True)
-        return 2
-    except ValueError as error:
-        say(f"fieldcal visit: {error}", err=True)
-        return 2
-    except FileExistsError:
-        say(f"fieldcal visit: {options['data_dir']} exists; name a new directory with --data-dir", err=True)
-        return 2
-    except OSError as error:
-        say(f"fieldcal visit: {error.filename or options['data_dir']}: {error.strerror}", err=True)
+    except (ConfigError, ValueError, OSError) as error:
+        say_fault(error, "visit", options["data_dir"], "--data-dir")
         return 2
     return 0 if complete else 3
 
