@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agent.fleet.simulated import NEVER, SimulatedFleet, behaviours
+from agent.fleet.simulated import NEVER, FleetPlan, SimulatedFleet, behaviours
 from agent.fleet.simulated_sensor import BEGINS
 from benchmarks.page import machine, write_part
 from tests.unit.browser import chromium
@@ -110,8 +110,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as directory, chromium() as browser:
         monitor, data = Monitor(site.endpoint, Path(directory) / "monitor"), Path(directory) / "fleet"
         with (
-            SimulatedFleet(GATEWAYS, SENSORS, SEED, [site.endpoint], data, others) as fleet,
-            SimulatedFleet(GATEWAYS, SENSORS, SEED, [site.endpoint], data, late) as to_be_held,
+            SimulatedFleet(FleetPlan(GATEWAYS, SENSORS, SEED, [site.endpoint], data), others) as fleet,
+            SimulatedFleet(FleetPlan(GATEWAYS, SENSORS, SEED, [site.endpoint], data), late) as to_be_held,
         ):
             make(fleet, ROUNDS, monitor, len(others) * SENSORS)
             make(to_be_held, HELD_FROM, monitor, GATEWAYS * SENSORS)

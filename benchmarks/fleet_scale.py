@@ -29,7 +29,7 @@ import numpy as np
 
 from agent.config.known_keys import add_key
 from agent.delivery.router import router_running
-from agent.fleet.simulated import SITE
+from agent.fleet.simulated import SITE, FleetPlan
 from agent.fleet.simulated_processes import FleetProcesses
 from agent.monitor.engines import DatabaseEngine, open_engine
 from benchmarks.fleet_programs import Asked, Probe, Program, Usage, tree
@@ -113,7 +113,7 @@ class Scene:
         wait(lambda: router_running(endpoint), 20.0)
         began_s = time.monotonic()
         self.fleet = opened.enter_context(
-            FleetProcesses(args.gateways, args.sensors, 7, [endpoint], place / "gateways")
+            FleetProcesses(FleetPlan(args.gateways, args.sensors, 7, [endpoint], place / "gateways"))
         )
         self.opened_s = time.monotonic() - began_s
         for gateway in self.fleet.gateways:

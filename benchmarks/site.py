@@ -66,7 +66,7 @@ def simulated(seed: int) -> tuple[SimulatedSite, list[Link]]:
 def devices_of(sensors: int, references: int, u: float) -> list[SiteDevice]:
     """What is known of them."""
     return [SiteDevice.reference(f"r{k}", u, 3) for k in range(references)] + [
-        SiteDevice.known(f"s{k}", NOMINAL, PRIOR) for k in range(sensors)
+        SiteDevice.with_covariance(f"s{k}", NOMINAL, PRIOR) for k in range(sensors)
     ]
 
 

@@ -41,7 +41,7 @@ from agent.monitor.database import Database
 from agent.monitor.engines import Sqlite
 from agent.monitor.watch_store import KEPT_DAYS, close_day, source_of
 from agent.site_watch.day_sum import DaySum
-from agent.site_watch.view import seen
+from agent.site_watch.view import watch_site
 from benchmarks.beam_world import BANDS_HZ, FREQUENCY_HZ, Bridge, Damage, World, changed, turned
 from benchmarks.page import machine, write_part
 from calib.model import Array
@@ -457,7 +457,7 @@ def _kept(sensors: int, engine: Sqlite) -> str:
             "INSERT INTO watch_day VALUES ('bridge', :day, :last, 0, 0, :payload)",
             day=one.number, last=24 * one.number + 23, payload=msgspec.msgpack.encode(one),
         )  # fmt: skip
-    year, _ = used(lambda: seen(source_of(database.query, "bridge", closed=True)))
+    year, _ = used(lambda: watch_site(source_of(database.query, "bridge", closed=True)))
     a_year = (365 * day / sensors + KEPT_DAYS * 24 * an_hour) / 1e6
     return f"{hour:.0f} | {day / sensors:.0f} | {a_year:.1f} | {year:.1f} | {1e3 * taken / len(batches):.0f}"
 

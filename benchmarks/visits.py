@@ -25,11 +25,11 @@ import numpy as np
 
 from agent.bench.capture import DeviceSamples
 from agent.bench.clamp_words import findings
-from agent.bench.kinds import mounted, stated, write_prior
+from agent.bench.kinds import mounted_stop, stated_options, write_prior
 from agent.bench.measuring import Measuring, Record, StopInterval
-from agent.bench.visiting import looked
+from agent.bench.visiting import look_at
 from agent.calibrate.stated import options_of
-from agent.cli.led import parsed
+from agent.cli.leading import calibrate_options
 from agent.config import Channel, parse_config
 from benchmarks.page import machine, write_part
 from calib.visit.next_stop import MAIN, WantedUncertainty
@@ -78,7 +78,7 @@ class Visit:
         with tempfile.TemporaryDirectory() as name:
             directory = Path(name)
             write_prior(channel, None, directory / "prior.json")
-            measuring = Measuring(channel, options_of(parsed(stated(channel, directory, ""))))
+            measuring = Measuring(channel, options_of(calibrate_options(stated_options(channel, directory, ""))))
         return cls(Structure(parameters, seed, way), channel, measuring)
 
     def record(self, seconds: float) -> Record:
@@ -92,7 +92,7 @@ class Visit:
 
     def taken(self, seconds: float) -> StopInterval:
         """All of it but the ends."""
-        return StopInterval(mounted(self.channel), EDGE_S, seconds - EDGE_S)
+        return StopInterval(mounted_stop(self.channel), EDGE_S, seconds - EDGE_S)
 
     def relative_error(self, sensitivity: np.ndarray) -> np.ndarray:
         """(9,) errors of S over the main sensitivities."""
@@ -106,14 +106,14 @@ def kept(visits: int, level_mps2: float) -> str:
     errors, told, times = [], [], []
     for seed in range(visits):
         visit, seconds = Visit.drawn(seed, Clamped(), level_mps2), LOOKED_S
-        first = looked(visit.measuring, wanted, visit.record(seconds), visit.taken(seconds)).ahead
+        first = look_at(visit.measuring, wanted, visit.record(seconds), visit.taken(seconds)).ahead
         while first is None:  # refused, since so short a record does not tell the response
             seconds += LOOKED_S
-            first = looked(visit.measuring, wanted, visit.record(seconds), visit.taken(seconds)).ahead
+            first = look_at(visit.measuring, wanted, visit.record(seconds), visit.taken(seconds)).ahead
         later = first
         while later.needed_s > seconds - 2.0 * EDGE_S and seconds < MOST_S:
             seconds = min(1.15 * seconds, MOST_S)
-            later = looked(visit.measuring, wanted, visit.record(seconds), visit.taken(seconds)).ahead or later
+            later = look_at(visit.measuring, wanted, visit.record(seconds), visit.taken(seconds)).ahead or later
         if seconds < MOST_S and later is not first:
             times.append(first.needed_s / (seconds - 2.0 * EDGE_S))
         outcome = visit.measuring.outcome(visit.record(seconds), [visit.taken(seconds)])
@@ -144,7 +144,7 @@ def named(visits: int, u_transverse: float) -> list[str]:
         for seed in range(visits):
             this = replace(way, turned_deg=TURNED_DEG * axes[seed % 6]) if kind == "turned" else way
             visit = Visit.drawn(seed, this, u_transverse=u_transverse)
-            look = looked(
+            look = look_at(
                 visit.measuring, WantedUncertainty(0.005, np.inf), visit.record(LOOKED_S), visit.taken(LOOKED_S)
             )
             said[", ".join(sorted(findings(look.clamp, SENSOR))) if look.clamp else "nothing seen"] += 1

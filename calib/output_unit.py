@@ -34,14 +34,14 @@ class DisplayUnits:
         return f"S in {S}, Q in {self.offset}"
 
 
-def written(unit: str) -> str:
+def unit_text(unit: str) -> str:
     """The unit as people write it; "output unit" where nothing tells it."""
     return _WRITTEN.get(unit, unit.replace("/s^2", "/s²").replace("/s2", "/s²")) or "output unit"
 
 
 def shown_in(unit: str) -> DisplayUnits:
     """How S and Q of an output in `unit` are shown: as they are, but S in g/g and Q in mg where the output is in g."""
-    name = written(unit)
+    name = unit_text(unit)
     if (one_g := G_IN.get(name)) is not None:
         return DisplayUnits(IN_G, "mg", _factors(STANDARD_GRAVITY_MPS2 / one_g, G_IN["mg"] / one_g))
     return DisplayUnits("1" if name == ACCELERATION else f"{name}/({ACCELERATION})", name, _factors(1.0, 1.0))

@@ -71,7 +71,7 @@ class FifoOptions(Options):
 
     @field_validator("rate_hz")
     @classmethod
-    def _known_rate(cls, value: float) -> float:
+    def _check_rate(cls, value: float) -> float:
         for rate in cls.rates_hz:
             if abs(value - rate) <= RATE_TOLERANCE * rate:
                 return rate
@@ -80,7 +80,7 @@ class FifoOptions(Options):
 
     @field_validator("bus")
     @classmethod
-    def _known_bus(cls, value: int | str) -> int | str:
+    def _check_bus(cls, value: int | str) -> int | str:
         text = str(value)
         if text.isdecimal():
             return int(text)
@@ -91,7 +91,7 @@ class FifoOptions(Options):
         return text
 
     @model_validator(mode="after")
-    def _of_this_bus(self) -> Self:
+    def _check_address(self) -> Self:
         for name in foreign_options(self.bus):
             if name in self.model_fields_set:
                 why = "on SPI the chip select in bus names the device" if self.over_spi else "bus names an I2C bus"

@@ -42,7 +42,7 @@ class Mcc172Options(Options):
 
     @field_validator("rate_hz")
     @classmethod
-    def _known_rate(cls, value: float) -> float:
+    def _check_rate(cls, value: float) -> float:
         divider = round(BASE_RATE_HZ / value)
         if divider not in DIVIDERS or abs(BASE_RATE_HZ / divider - value) > RATE_TOLERANCE * value:
             near = BASE_RATE_HZ / min(max(divider, 1), 256)

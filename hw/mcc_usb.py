@@ -192,7 +192,7 @@ class MccUsb(BufferedSensor):
             first, self._read = self._read, transfer.current_scan_count
             samples = self._copied(first, self._read)
             _, after = self._ai.get_scan_status()
-            overrun = after.current_scan_count - first > self._kept
+            overrun = after.current_scan_count - first > self._capacity
         except library.ULException as error:
             if error.error_code.name not in OVERRUNS:
                 raise DeviceLost(f"{self._where()}: {error}") from error
@@ -204,14 +204,14 @@ class MccUsb(BufferedSensor):
         return MV_PER_V * samples, overrun
 
     @property
-    def _kept(self) -> int:
+    def _capacity(self) -> int:
         """Scans that may wait: half the ring, because the library may be writing into the other half."""
         return int(len(self._ring) // self._options.axes // 2)
 
     def _copied(self, first: int, stop: int) -> NDArray[np.float64]:
-        """Copy scans first .. stop - 1; only the newest ones if there are more than `_kept`."""
+        """Copy scans first .. stop - 1; only the newest ones if there are more than `_capacity`."""
         ring = np.ctypeslib.as_array(self._ring).reshape(-1, self._options.axes)
-        return np.asarray(ring[np.arange(max(first, stop - self._kept), stop) % len(ring)])
+        return np.asarray(ring[np.arange(max(first, stop - self._capacity), stop) % len(ring)])
 
     def _again(self, library: Any) -> None:
         try:

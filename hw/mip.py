@@ -138,7 +138,7 @@ class Mip(AskedSensor):
         self._idle(port)
         told = self._ask(port, mip.BASE, mip.DEVICE_INFO, least=82)
         model, _, number, _, options = (mip.text(told[at : at + 16]) for at in range(2, 82, 16))
-        known = self._known(port)
+        known = self._descriptors(port)
         self._stream.clock = self._clock_field(known)
         generation = mip.generation(known)
         decimation = self._set_format(port, generation)
@@ -213,7 +213,7 @@ class Mip(AskedSensor):
                 return answer, heard
         return None, heard
 
-    def _known(self, port: serial.Serial) -> set[tuple[int, int]]:
+    def _descriptors(self, port: serial.Serial) -> set[tuple[int, int]]:
         """The descriptors that the device knows: commands and data."""
         told = self._ask(port, mip.BASE, mip.DESCRIPTORS)
         known = mip.descriptors(told)

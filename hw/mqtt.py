@@ -57,7 +57,7 @@ class MqttOptions(Options):
 
     @field_validator("metrics")
     @classmethod
-    def _one_or_three(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_axes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if len(value) not in (1, 3) or len(set(value)) != len(value) or not all(value):
             raise ValueError(f"1 or 3 different names are needed, not {', '.join(value)}")
         return value
@@ -137,11 +137,11 @@ class Mqtt(MessageSensor):
             client.connect(o.host, o.port, KEEP_ALIVE_S, clean_start=True, properties=properties)
         except OSError as error:
             raise DeviceLost(f"{self._where()}: {error}") from error
-        self._answered(codes, "the connection")
+        self._wait_for_answer(codes, "the connection")
         _, _ = client.subscribe(o.topic, options=_library("subscribeoptions").SubscribeOptions(retainHandling=2))
-        self._answered(codes, "the subscription")
+        self._wait_for_answer(codes, "the subscription")
 
-    def _answered(self, codes: list[Any], what: str) -> None:
+    def _wait_for_answer(self, codes: list[Any], what: str) -> None:
         """Wait for the answer of the broker. Raises ConfigurationError where it refuses."""
         latest_ns = self._clock()[0] + round(ANSWER_S * 1e9)
         while not codes:

@@ -41,7 +41,7 @@ class NiOptions(Options):
 
     @field_validator("channels")
     @classmethod
-    def _one_or_three(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_axes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if len(value) not in (1, 3):
             raise ValueError(f"1 or 3 channels are needed, not {len(value)}")
         if not all(channel.partition("/")[2] for channel in value):

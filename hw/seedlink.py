@@ -31,7 +31,7 @@ class SeedlinkOptions(Options):
 
     @field_validator("channels")
     @classmethod
-    def _one_or_three(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_axes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if len(value) not in (1, 3) or len(set(value)) != len(value):
             raise ValueError(f"1 or 3 different channels are needed, not {', '.join(value)}")
         if not all(len(channel) == 3 and channel.isascii() and channel.isalnum() for channel in value):

@@ -41,7 +41,7 @@ def lasting_name(path: str) -> str:
     return next((port["port"] for port in serial_ports() if port["device"] == path), path)
 
 
-def ports_there() -> str:
+def present_ports() -> str:
     """The serial ports that are there now, for a message."""
     ports = serial_ports()
     names = [p["port"] if p["port"] == p["device"] else f"{p['port']} ({p['device']})" for p in ports]

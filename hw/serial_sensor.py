@@ -15,7 +15,7 @@ from pydantic import Field
 from hw.block import DeviceInfo, Drop, SampleBlock
 from hw.polling import BLOCK_S, PollingSensor
 from hw.sensor import ConfigurationError, DeviceLost, Options
-from hw.serial_ports import ports_there
+from hw.serial_ports import present_ports
 
 GATHER_S = 0.010  # at 1 kHz one wake-up serves ten samples; 115 bytes of the kernel's 4 kB at 115200 baud
 # Below this rate each sample is read as it arrives: the port wakes the reader, GATHER_SLOW_S lets the sample finish
@@ -108,7 +108,7 @@ class SerialSensor(PollingSensor):
         try:
             return serial.Serial(options.port, options.baud_rate, timeout=BLOCK_S, exclusive=True)
         except LOST as error:
-            there = f"; {ports_there()}" if getattr(error, "errno", None) == errno.ENOENT else ""
+            there = f"; {present_ports()}" if getattr(error, "errno", None) == errno.ENOENT else ""
             raise DeviceLost(f"{self._where()}: {reason_of(error)}{there}") from error
         except ValueError as error:
             raise ConfigurationError(f"{self._where()}, baud_rate {options.baud_rate}: {error}") from error

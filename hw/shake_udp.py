@@ -44,7 +44,7 @@ class ShakeUdpOptions(Options):
 
     @field_validator("channels")
     @classmethod
-    def _one_or_three(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_axes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if len(value) not in (1, 3) or len(set(value)) != len(value):
             raise ValueError(f"1 or 3 different channels are needed, not {', '.join(value)}")
         if not all(len(channel) == 3 and channel[:2] in QUANTITIES for channel in value):

@@ -42,7 +42,7 @@ class World:
     def __init__(self, seed: int) -> None:
         self._seed = seed
         random = np.random.default_rng([seed, 0])
-        self._motion = BuildingMotion(random, BAND, 0.0, LONGEST_S, LEVEL_MPS2, np.eye(3))
+        self._motion = BuildingMotion(random, BAND, (0.0, LONGEST_S), LEVEL_MPS2, np.eye(3))
 
     def values(self, device: str, first: int, n: int, reference: str = "A") -> Array:
         """Indications (n, 3) of samples first .. first + n - 1, m/s2; `reference` is the serial number of the

@@ -176,7 +176,7 @@ class Reader(threading.Thread):
                 told, self._works, self.refused = True, True, ""
                 self._attempt = self._faults = 0
                 self._events.put(self.device, block)
-                if self._tested(block, info):
+                if self._self_test(block, info):
                     return  # the device has to be opened again
             if not info.own_clock and (early_s := began_s + SHORTEST_CALL_S - time.monotonic()) > 0:
                 self._stop_request.wait(early_s)  # a driver that does not wait must not take the processor
@@ -212,7 +212,7 @@ class Reader(threading.Thread):
             raise DeviceLost(f"the driver {self._driver} returned from {call[0]}, but after more than {HANGS_S:g} s")
         return result
 
-    def _tested(self, block: SampleBlock, info: DeviceInfo) -> bool:
+    def _self_test(self, block: SampleBlock, info: DeviceInfo) -> bool:
         """Let the device test itself, if that is due; whether it did. Raises what the driver raises."""
         plan, sensor = self._self_testing, self._sensor
         if plan is None or info.nominal_sensitivity is None or not isinstance(sensor, SelfTestingSensor):

@@ -200,10 +200,10 @@ class Service:
         self._engine_sha256 = keep_engine(self._data_dir)
         self._origin_ns = time.monotonic_ns()
         self._pipeline = Pipeline.begin(
-            self._config, self._run_id, self._origin_ns, self._store.last_sequence(), self._kept()
+            self._config, self._run_id, self._origin_ns, self._store.last_sequence(), self._earlier_states()
         )
 
-    def _kept(self) -> dict[str, dict[str, bytes]]:
+    def _earlier_states(self) -> dict[str, dict[str, bytes]]:
         """The states of the estimation that earlier runs left, by sensor and by identity of the device."""
         kept: dict[str, dict[str, bytes]] = {}
         for memory in self._store.states:
@@ -267,7 +267,7 @@ class Service:
         writer.put(self._sequence, event, outputs, self._pipeline.memories(outputs))
         results = [item for item in outputs if isinstance(item, Result)]
         self._watch.update(event, results)
-        for told in self._weighing.told(event):
+        for told in self._weighing.messages(event):
             _log.warning("%s", told)
         if self._publisher is not None:
             for item in outputs:

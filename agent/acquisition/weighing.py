@@ -39,7 +39,7 @@ class Weighing:
         self._sums: dict[str, _SampleSums] = {}
         self._nominal: dict[str, float | None] = {}
 
-    def told(self, event: Event) -> list[str]:
+    def messages(self, event: Event) -> list[str]:
         """What is to be said after this event."""
         if isinstance(event, DeviceChange) and event.state == "open" and event.device not in self._nominal:
             info = json.loads(event.info_json)
@@ -53,9 +53,9 @@ class Weighing:
         if held.count < FIRST_S * event.nominal_rate_hz:
             return []
         mean = self._sums.pop(event.device).total / held.count
-        return [told for channel in self._channels for told in self._weighed(channel, event.device, mean)]
+        return [told for channel in self._channels for told in self._judgement(channel, event.device, mean)]
 
-    def _weighed(self, channel: Channel, device: str, mean: Array) -> Iterator[str]:
+    def _judgement(self, channel: Channel, device: str, mean: Array) -> Iterator[str]:
         """What the mean (3,) of a device says of this channel."""
         g, length = channel.gravity_mps2, float(np.linalg.norm(mean))
         at_rest = (

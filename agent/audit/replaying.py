@@ -21,7 +21,7 @@ from agent.core.events import CalibrationUpdate, Event, Output, Pruned, Result, 
 from agent.core.memory import Memory
 from agent.engine.process import EngineError
 from agent.recording.comparison import Difference, compare
-from agent.recording.continuation import UNKEPT_MAX, continues, left
+from agent.recording.continuation import UNKEPT_MAX, continues, states_left
 from agent.recording.messages import decode, encode, recorded_ones, schema_of, topic_of
 from agent.recording.reading import RecordedStep, RecordingReader
 from agent.recording.records import FileFault
@@ -366,7 +366,7 @@ class _LeftState:
     def take(self, replayed: Replayed, start: RunStart) -> None:
         """Take the next recording."""
         sensors, known = _sensors(start), bool(replayed.left_sha256)
-        self._memories = left(self._memories, replayed.left, sensors)
+        self._memories = states_left(self._memories, replayed.left, sensors)
         self._sensors = self._sensors | sensors if known else self._sensors - sensors
         self._all = self._all and known
         self._last_result = max(self._last_result, replayed.last_result)

@@ -103,7 +103,7 @@ class Capture(threading.Thread):
         with self._lock:
             return self._infos.get(device)
 
-    def said(self) -> list[str]:
+    def messages(self) -> list[str]:
         """What happened to devices since the last call."""
         return [self._said.get() for _ in range(self._said.qsize())]
 

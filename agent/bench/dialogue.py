@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from agent.bench.capture import Capture
 from agent.bench.measuring import StopInterval
-from agent.bench.screen import BenchScreen, count, pair, told_u
+from agent.bench.screen import BenchScreen, count, pair, u_text
 from agent.bench.session import BenchSession, Outlook, StopFit
 from agent.bench.stops import BenchStop
 from agent.bench.thinking import Look, Thinking
@@ -84,7 +84,7 @@ class Dialogue:
                 break
             self._take(stop)
         else:
-            self._screen.outlook([f"reached after {count(len(self.taken))}: U {told_u(self._session.joint.expanded)}"])
+            self._screen.outlook([f"reached after {count(len(self.taken))}: U {u_text(self._session.joint.expanded)}"])
 
     def _begin(self) -> None:
         wanted, (_, outlook) = self._session.wanted, self._mind.next_stop()
@@ -115,7 +115,7 @@ class Dialogue:
             answer = self._screen.ask(
                 f"  Enter when it stands ({stop.name}); another position as typed; u: undo; q: end > "
             )
-            for line in self._capture.said():
+            for line in self._capture.messages():
                 self._screen.warn(line)
             if answer is None or answer == "q":
                 return None
@@ -123,11 +123,11 @@ class Dialogue:
                 self._undo()
                 return self._next_stop()
             if answer.startswith("hand ") and self._turn is not None:
-                stood = self._session.named(answer.removeprefix("hand "))
+                stood = self._session.stop_named(answer.removeprefix("hand "))
                 if stood is not None:
                     self._put(stood)
                     return stop
-            chosen = stop if answer == "" else self._session.named(answer)
+            chosen = stop if answer == "" else self._session.stop_named(answer)
             if chosen is not None:
                 if self._turn is not None:
                     self._put(chosen)
@@ -148,7 +148,7 @@ class Dialogue:
         gone = self.taken.pop()
         self._say(f"  stop {len(self.taken) + 1} ({gone.stop.name}) is not used")
         self._adjust()
-        self._screen.kept(self._names, self._session.joint.expanded)
+        self._screen.show_stops(self._names, self._session.joint.expanded)
 
     def _take(self, stop: BenchStop) -> None:
         """Stay at a stop, and use it if it is sound."""
@@ -226,7 +226,7 @@ class Dialogue:
             time.sleep(LOOK_S)
             now_s = self._capture.now_s
             stayed_s = now_s - start_s
-            for line in self._capture.said():
+            for line in self._capture.messages():
                 self._screen.warn(line)
             if (dumb := self._capture.silent(self._mind.measuring.devices, now_s, STALE_S)) is not None:
                 self._screen.warn(f"no samples of {dumb} for {STALE_S:g} s: check its cable")

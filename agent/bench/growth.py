@@ -64,7 +64,7 @@ class Growth:
             low, high = (low, middle) if self.main_pct(middle) > limit_pct else (middle, high)
         return low
 
-    def told(self, limit_pct: float, now: datetime) -> dict[str, Any]:
+    def as_object(self, limit_pct: float, now: datetime) -> dict[str, Any]:
         """The members of the JSON object."""
         days = self.days_until(limit_pct)
         after = [

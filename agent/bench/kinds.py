@@ -42,7 +42,7 @@ def stops_of(channel: Channel, thetas_deg: Sequence[float], alphas_deg: Sequence
     return turned_by_hand(np.reshape(channel.rotation, (3, 3)), channel.gravity_mps2)
 
 
-def mounted(channel: Channel) -> BenchStop:
+def mounted_stop(channel: Channel) -> BenchStop:
     """A mounted sensor beside a tri-axial reference, which feels gravity and so tells how both stand."""
     assert channel.rotation is not None
     up = np.array([0.0, 0.0, channel.gravity_mps2])  # read again, it only shows that gravity is felt
@@ -51,7 +51,7 @@ def mounted(channel: Channel) -> BenchStop:
     return BenchStop("", channel.sensor, pose, dict(zip(GRAVITY, up.tolist(), strict=True)), np.zeros(3))
 
 
-def stated(channel: Channel, directory: Path, unit: str) -> list[str]:
+def stated_options(channel: Channel, directory: Path, unit: str) -> list[str]:
     """The options of `fieldcal calibrate` that state what the configuration states, with files of `directory`.
 
     `unit`: of the sensor's output, as its driver states it.

@@ -66,9 +66,9 @@ class Measuring:
         except ValueError:
             return []
 
-    def all(self, record: Record, taken: Sequence[StopInterval]) -> tuple[list[Window], Priors]:
+    def windows_and_priors(self, record: Record, taken: Sequence[StopInterval]) -> tuple[list[Window], Priors]:
         """The used windows of all stops, with their lag taken out, and the priors for them."""
-        windows = _used(self.without_lag(record, taken))
+        windows = _used_windows(self.without_lag(record, taken))
         return windows, over_frequency(self.priors, windows, self.lag_s)
 
     def without_lag(self, record: Record, taken: Sequence[StopInterval]) -> list[Window]:
@@ -77,16 +77,16 @@ class Measuring:
 
         def lag_of(windows: Sequence[Window], lag_s: float) -> float:
             priors = with_response(self.priors, windows)
-            return adjust(_used(windows), priors, replace(applied, lag_s=lag_s)).common_lag_s or 0.0
+            return adjust(_used_windows(windows), priors, replace(applied, lag_s=lag_s)).common_lag_s or 0.0
 
-        windows, self.lag_s = without_lag(self.lag_s, self._tables(record, taken).windows, _used, lag_of)
+        windows, self.lag_s = without_lag(self.lag_s, self._tables(record, taken).windows, _used_windows, lag_of)
         return windows
 
     def outcome(self, record: Record, taken: Sequence[StopInterval]) -> Outcome:
         """What `fieldcal calibrate` would say of these stops."""
         return adjusted(self._tables(record, taken), self.priors)
 
-    def refused(self, record: Record, taken: Sequence[StopInterval]) -> tuple[str, ...]:
+    def refusal_reasons(self, record: Record, taken: Sequence[StopInterval]) -> tuple[str, ...]:
         """Why `fieldcal calibrate` would refuse these stops; empty if it would not."""
         return self.outcome(record, taken).reasons
 
@@ -131,7 +131,7 @@ class Measuring:
         _write(directory / "poses.csv", ",".join(("start_s", "stop_s", *taken[0].stop.columns)), poses)
 
 
-def _used(windows: Sequence[Window]) -> list[Window]:
+def _used_windows(windows: Sequence[Window]) -> list[Window]:
     return [w for w in windows if w.used]
 
 

@@ -63,22 +63,22 @@ class Planned:
 
 def states_positions(channel: Channel) -> bool:
     """Whether the configuration states the positions, or that the sensor stands beside a tri-axial reference."""
-    return channel.rotation is not None or bool(_stated(channel))
+    return channel.rotation is not None or bool(_stated_positions(channel))
 
 
-def planned(channel: Channel, nominal: float | None) -> Planned:
+def plan_of(channel: Channel, nominal: float | None) -> Planned:
     """What the stated positions tell. `nominal` is the sensitivity by the data sheet of the device.
 
     Raises ValueError where S by the prior cannot be a start.
     """
-    return _told_by(channel, nominal, _stops(channel))
+    return _plan_by(channel, nominal, _stops(channel))
 
 
-def more_stops(channel: Channel, nominal: float | None) -> list[BenchStop]:
+def missing_stops(channel: Channel, nominal: float | None) -> list[BenchStop]:
     """The positions that are missing, the one that gains most first; empty where no position helps."""
     stops, candidates = _stops(channel), _candidates(channel)
     found: list[BenchStop] = []
-    while candidates and not _told_by(channel, nominal, [*stops, *found]).enough:
+    while candidates and not _plan_by(channel, nominal, [*stops, *found]).enough:
         if len(found) == MOST_MORE:
             return []
         priors = _priors(channel, nominal)
@@ -98,16 +98,16 @@ def if_in_radians(channel: Channel) -> Channel | None:
         return one.model_copy(update={name: float(np.degrees(value)) for name, value in in_rad.items()})
 
     name = "poses" if channel.poses else "positions"
-    return channel.model_copy(update={name: tuple(turned(one) for one in _stated(channel))})
+    return channel.model_copy(update={name: tuple(turned(one) for one in _stated_positions(channel))})
 
 
 def angles_deg(channel: Channel) -> list[tuple[float, float]]:
     """theta and alpha of each position on a clamp."""
-    pairs = ((one.theta_deg, one.alpha_deg) for one in _stated(channel))
+    pairs = ((one.theta_deg, one.alpha_deg) for one in _stated_positions(channel))
     return [(theta, alpha) for theta, alpha in pairs if theta is not None and alpha is not None]
 
 
-def _stated(channel: Channel) -> Sequence[Stated]:
+def _stated_positions(channel: Channel) -> Sequence[Stated]:
     return channel.poses or (() if channel.positions == "free" else channel.positions)
 
 
@@ -119,7 +119,7 @@ def _stops(channel: Channel) -> list[BenchStop]:
         of_gravity = channel.coupling == "dc" and stated is not None and not any(stated)
         up = channel.gravity_mps2 * np.array([0.0, 0.0, 1.0]) if of_gravity else np.zeros(3)
         return [BenchStop("", "", pose, {}, np.reshape(channel.rotation, (3, 3)).T @ up)]
-    forms = {(one.theta_deg, one.alpha_deg, one.direction, one.gravity_mps2): one for one in _stated(channel)}
+    forms = {(one.theta_deg, one.alpha_deg, one.direction, one.gravity_mps2): one for one in _stated_positions(channel)}
     some = np.unique(np.linspace(0, len(forms) - 1, min(len(forms), MOST_STOPS)).astype(int))
     chosen = [list(forms.values())[k] for k in some]
     felt = channel.coupling == "dc"
@@ -134,7 +134,7 @@ def _candidates(channel: Channel) -> list[BenchStop]:
     if channel.reference is None:
         return on_faces(channel.gravity_mps2)
     felt = channel.gravity_mps2 if channel.coupling == "dc" else 0.0
-    stated = _stated(channel)
+    stated = _stated_positions(channel)
     if not stated or stated[0].theta_deg is not None:
         thetas = sorted({*THETAS_DEG, *(one.theta_deg for one in stated if one.theta_deg)})
         return on_clamp(thetas, ALPHAS_DEG, felt, channel.static_sign)
@@ -145,7 +145,7 @@ def _candidates(channel: Channel) -> list[BenchStop]:
     return found
 
 
-def _told_by(channel: Channel, nominal: float | None, stops: Sequence[BenchStop]) -> Planned:
+def _plan_by(channel: Channel, nominal: float | None, stops: Sequence[BenchStop]) -> Planned:
     priors = _priors(channel, nominal)
     before, once = JointCovariance.before(priors, _scale(priors)), _after(stops, priors)
     often = _after(stops, priors.with_values({"offset_mps2": priors.offset_mps2 / np.sqrt(OFTEN)}))

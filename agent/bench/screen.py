@@ -6,6 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,19 +35,22 @@ from calib.visit.next_stop import MAIN, POWER, Suggestion, WantedUncertainty
 NAME_MAX = 63
 
 
+@dataclass(frozen=True)
+class Person:
+    """Who is led, at a terminal. `ask` gives the answer to a question, None at the end of input."""
+
+    ask: Callable[[str], str | None]
+    say: Callable[[str], None]
+    progress: Callable[[str], None]
+
+
 class BenchScreen:
-    """Says each thing to both. `publish` takes the guide, `ask`, `say` and `progress` are of the terminal."""
+    """Says each thing to both. `publish` takes the guide."""
 
     def __init__(
-        self,
-        sensor: str,
-        wanted: WantedUncertainty,
-        ask: Callable[[str], str | None],
-        say: Callable[[str], None],
-        progress: Callable[[str], None],
-        publish: Callable[[Guide], None],
+        self, sensor: str, wanted: WantedUncertainty, person: Person, publish: Callable[[Guide], None]
     ) -> None:
-        self._ask, self.say, self._progress, self._publish = ask, say, progress, publish
+        self._ask, self.say, self._progress, self._publish = person.ask, person.say, person.progress, publish
         self._stop = 1
         target = Expanded(100.0 * wanted.main, 100.0 * wanted.transverse)
         self._guide = Guide(t_utc_ns=0, sensor=sensor, stage="planning", wanted=target)
@@ -79,12 +83,12 @@ class BenchScreen:
     def turn(self, number: int, stop: BenchStop, best: Suggestion, session: BenchSession, ahead: Outlook) -> None:
         """Say which position comes next, why, and what U will be after it."""
         before, more = session.joint.expanded, None if ahead.stops is None else max(ahead.stops - 1, 0)
-        why = _gained(before, best.expanded, session.wanted)
+        why = _most_improved(before, best.expanded, session.wanted)
         self._stop = number
         self.say(f"stop {number}: {stop.told}")
         self.say(f"  it tells most of {why}")
         then = f"; {count(more)} more then to what is wanted" if more else ""
-        self.say(f"  U will be {told_u(best.expanded)}{then}")
+        self.say(f"  U will be {u_text(best.expanded)}{then}")
         after = _expanded(best.expanded)
         coming = NextStop(number, clipped(stop.name, NAME_MAX), clipped(stop.told), clipped(why), after, more)
         self._show(stage="turn", next=coming, staying=None, expanded=_expanded(before))
@@ -92,7 +96,7 @@ class BenchScreen:
     def stay(self, stop: BenchStop, stayed_s: float, least_s: float, most_s: float, u: Array | None) -> None:
         """Show how the present position goes on. `u` (9,): U with it, None as long as it is not known."""
         if u is not None:
-            self._progress(f"  {stayed_s:3.0f} s: U will be {told_u(u)}")
+            self._progress(f"  {stayed_s:3.0f} s: U will be {u_text(u)}")
         now = None if u is None else _expanded(u)
         self._show(stage="measuring", staying=Staying(clipped(stop.name, NAME_MAX), stayed_s, least_s, most_s, now))
 
@@ -102,22 +106,22 @@ class BenchScreen:
 
     def took(self, names: Sequence[str], u: Array) -> None:
         """The newest of these stops is used, and U (9,) is what is known now."""
-        self.say(f"  stop {len(names)}, {names[-1]}: U is now {told_u(u)}")
-        self.kept(names, u)
+        self.say(f"  stop {len(names)}, {names[-1]}: U is now {u_text(u)}")
+        self.show_stops(names, u)
 
-    def kept(self, names: Sequence[str], u: Array) -> None:
+    def show_stops(self, names: Sequence[str], u: Array) -> None:
         """These stops are used, of which the last or a name was changed."""
         now = _expanded(u)
         known = [each.expanded for each in self._guide.taken] + [now]
         taken = [TakenStop(clipped(name, NAME_MAX), e) for name, e in zip(names, known, strict=False)]
         self._show(taken=taken[-STOPS_MAX:], expanded=now, staying=None)
 
-    def ended(self, output: Path | None, status: int) -> None:
+    def show_end(self, output: Path | None, status: int) -> None:
         """The session is over; `output` has the result, `status` is the exit status of the program."""
         self._show(stage="ended", next=None, staying=None, prompt="", ending=_ending(output, status))
 
 
-def _gained(before: Array, after: Array, wanted: WantedUncertainty) -> str:
+def _most_improved(before: Array, after: Array, wanted: WantedUncertainty) -> str:
     """The element of S of which a stop tells most, by what the plan compares stops with, and its U."""
     cost = (before / wanted.by_parameter) ** POWER - (after / wanted.by_parameter) ** POWER
     k = int(np.argmax(cost))
@@ -166,6 +170,6 @@ def pair(main: float, transverse: float) -> str:
     return f"{100.0 * main:.2g} % (main), {100.0 * transverse:.2g} % (transverse)"
 
 
-def told_u(expanded: Array) -> str:
+def u_text(expanded: Array) -> str:
     """U (9,) as text."""
     return pair(float(expanded[MAIN].max()), float(expanded[~MAIN].max()))

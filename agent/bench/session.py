@@ -96,7 +96,7 @@ class BenchSession:
         """The number of a stop among `stops`."""
         return next(k for k, each in enumerate(self.stops) if each.name == stop.name)
 
-    def named(self, text: str) -> BenchStop | None:
+    def stop_named(self, text: str) -> BenchStop | None:
         """The stop that a person typed; a position of the clamp that was not among `stops` is from now on.
 
         None where the text is no position.

@@ -76,5 +76,5 @@ def _take(
     if not taken:
         session.restart()
         return session, measuring, ()
-    session.take(*measuring.all(record, taken))
-    return session, measuring, measuring.refused(record, taken) if session.reached else ()
+    session.take(*measuring.windows_and_priors(record, taken))
+    return session, measuring, measuring.refusal_reasons(record, taken) if session.reached else ()

@@ -13,7 +13,7 @@ from agent.bench.capture import Capture
 from agent.bench.clamp_words import as_object, findings
 from agent.bench.dialogue import BEFORE_S, GAIN, SETTLED_S, STALE_S
 from agent.bench.measuring import StopInterval
-from agent.bench.screen import told_u
+from agent.bench.screen import Person, u_text
 from agent.bench.stops import BenchStop
 from agent.bench.visiting import Ahead, Visiting, VisitLook
 from calib.visit.clamping import Clamping
@@ -54,7 +54,7 @@ class Visited:
 
 
 class VisitDialogue:
-    """Leads one visit. `ask`, `say` and `progress` are as in agent.bench.dialogue.
+    """Leads one visit.
 
     `clamp` clamps a virtual reference as the answer says; None where a person does.
     """
@@ -64,13 +64,11 @@ class VisitDialogue:
         visiting: Visiting,
         capture: Capture,
         stay: VisitStay,
-        ask: Callable[[str], str | None],
-        say: Callable[[str], None],
-        progress: Callable[[str], None],
+        person: Person,
         clamp: Callable[[str], None] | None = None,
     ) -> None:
         self._visiting, self._capture, self._stay = visiting, capture, stay
-        self._ask, self._say, self._progress, self._clamp = ask, say, progress, clamp
+        self._ask, self._say, self._progress, self._clamp = person.ask, person.say, person.progress, clamp
         self._promised_s: float | None = None
         self._warned: set[str] = set()
 
@@ -80,7 +78,7 @@ class VisitDialogue:
         kept, visited = False, Visited("left out")
         while True:
             answer = self._ask(prompt)
-            for line in self._capture.said():
+            for line in self._capture.messages():
                 self._say(f"  {line}")
             if answer is None or answer == "q":
                 return Visited("quit")
@@ -102,7 +100,7 @@ class VisitDialogue:
         while True:
             time.sleep(wait_s)
             now_s = self._capture.now_s
-            for line in self._capture.said():
+            for line in self._capture.messages():
                 self._say(f"  {line}")
             if (dumb := self._capture.silent(self._visiting.measuring.devices, now_s, STALE_S)) is not None:
                 self._say(f"  no samples of {dumb} for {STALE_S:g} s: check its cable")
@@ -148,7 +146,7 @@ class VisitDialogue:
             return None
         if later is not None:
             how = "as wanted" if reached else "not as wanted"
-            self._say(f"  after {_span(stayed_s)}: U is {told_u(later.now)}, {how}")
+            self._say(f"  after {_span(stayed_s)}: U is {u_text(later.now)}, {how}")
         else:
             self._say(f"  after {_span(stayed_s)}: no result")
         return Visited("measured", taken, look, reached, self._promised_s, tuple(found.items()))
@@ -161,7 +159,7 @@ class VisitDialogue:
             if np.isinf(later.needed_s):
                 self._say(
                     f"  what is wanted cannot be reached however long you stay: U never becomes less than "
-                    f"{told_u(later.at_last)}, because of {later.because}"
+                    f"{u_text(later.at_last)}, because of {later.because}"
                 )
             else:
                 self._promised_s = later.needed_s
@@ -174,7 +172,7 @@ class VisitDialogue:
                     )
         left_s = max(later.needed_s - stayed_s, 0.0)
         ahead = "" if np.isinf(left_s) else f"; as wanted in {_span(left_s)}"
-        self._progress(f"  {stayed_s:3.0f} s: U is {told_u(later.now)}{ahead}")
+        self._progress(f"  {stayed_s:3.0f} s: U is {u_text(later.now)}{ahead}")
 
 
 def forbidden(u_reference: float, wanted_main: float) -> str:

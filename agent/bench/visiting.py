@@ -80,11 +80,11 @@ def ahead(outcome: Outcome, measured_s: float, wanted: WantedUncertainty) -> Ahe
     return Ahead(now, at_last, measured_s / float(ratio.min()), because)
 
 
-def looked(measuring: Measuring, wanted: WantedUncertainty, record: Record, taken: StopInterval) -> VisitLook:
+def look_at(measuring: Measuring, wanted: WantedUncertainty, record: Record, taken: StopInterval) -> VisitLook:
     """A look at the samples of a visit so far."""
     windows = measuring.newest(record, taken)
     if not any(w.used for w in windows):
-        return VisitLook(_clamp(measuring, windows), None, _why(windows))
+        return VisitLook(_clamp(measuring, windows), None, _refusal_reasons(windows))
     clamp = _clamp(measuring, measuring.without_lag(record, [taken]))
     if clamp is not None and clamp.drowned:  # an adjustment would take long, and tell nothing
         return VisitLook(clamp, None, ())
@@ -92,7 +92,7 @@ def looked(measuring: Measuring, wanted: WantedUncertainty, record: Record, take
     return VisitLook(clamp, ahead(outcome, taken.stop_s - taken.start_s, wanted), outcome.reasons)
 
 
-def _why(windows: Sequence[Window]) -> tuple[str, ...]:
+def _refusal_reasons(windows: Sequence[Window]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(w.reason for w in windows if w.reason)) or ("too few samples",)
 
 
@@ -113,4 +113,4 @@ class Visiting:
 
     def look(self, record: Record, taken: StopInterval) -> VisitLook:
         """A look at the samples so far."""
-        return self.aside.call(looked, self.measuring, self.wanted, record, taken)
+        return self.aside.call(look_at, self.measuring, self.wanted, record, taken)

@@ -25,7 +25,7 @@ def as_table_error(place: Callable[[int], str] = "row {}".format) -> Iterator[No
         error.remedy = f"{exchange}state the unit with --reference-columns time=NAME,{names}"
         raise TableError(with_dashes(str(error))) from None
     except InputError as error:
-        raise TableError(with_dashes(error.told(place))) from None
+        raise TableError(with_dashes(error.message(place))) from None
 
 
 def with_dashes(text: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from agent.calibrate.faults import as_table_error
 from agent.calibrate.times import Times
 from agent.reading.formats import NOT_DESCRIBED, Description, open_source
-from agent.reading.gravity import told_in_g
+from agent.reading.gravity import unit_warning
 from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
@@ -61,7 +61,7 @@ def read_sensor(
         times, values, restart = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
         unit = common([unit_name(c.unit) for c in chosen[1:4]])
         said, components = _described(source, choice, chosen[1:4])
-        said += told_in_g(path, "--columns", chosen[:4], Spooled(values, slice(0, 3)))
+        said += unit_warning(path, "--columns", chosen[:4], Spooled(values, slice(0, 3)))
         filters = source.filters.get(chosen[1].column.group, ())
     temperature_degc = Spooled(values, 3) if len(chosen) > 4 else None
     v = Spooled(values, slice(0, 3))
@@ -95,7 +95,7 @@ def read_reference(
         if restart:
             raise TableError(f"{restart}; a reference needs one clock: cut the file there")
         said, components = _described(source, choice, chosen[1:])
-        said += told_in_g(path, "--reference-columns", chosen, Spooled(values, slice(None)))
+        said += unit_warning(path, "--reference-columns", chosen, Spooled(values, slice(None)))
         filters = source.filters.get(chosen[1].column.group, ())
     column, header = str(chosen[1].column), source.header
     channels = Spooled(values, slice(None))
@@ -123,5 +123,5 @@ def _rows(
             whole += int(np.isfinite(rows[:, 1]).sum())
         check_count(whole, place)
         check_time(time_s := Spooled(times, 0), names[0], place)
-    source.said = (*source.said, *clock.said())
+    source.said = (*source.said, *clock.messages())
     return time_s, values, clock.restart

@@ -91,7 +91,7 @@ class Times:
         moved = raw - self._origin if shifts is None else raw - self._origin + shifts
         return np.asarray(moved * self._second)
 
-    def said(self) -> list[str]:
+    def messages(self) -> list[str]:
         """What was guessed, for the user."""
         told = [f"{where}: {kind}" + (f" ({n} times)" if n > 1 else "") for kind, (where, n) in self._told.items()]
         if self._dropped:

@@ -15,7 +15,7 @@ from agent import __version__
 from agent.calibrate.origin import SourceFile
 from agent.certificate.content import COVERAGE_PROBABILITY, EQUATION, CertificateError, ResultCertificate
 from agent.certificate.signing import CertificateSigner
-from agent.certificate.statements import NOT_IN_XML, Contact
+from agent.certificate.statements import NOT_IN_XML, Contact, Item, Reference
 from agent.config.earlier import COVARIANCE, DCC, PARAMETER_LIST, SI
 from agent.report.units import output_unit
 from agent.terminal.text import one_line
@@ -43,7 +43,7 @@ def dcc(c: ResultCertificate, signer: CertificateSigner) -> bytes:
         ET.register_namespace(prefix, space)
     root = ET.Element(_dcc("digitalCalibrationCertificate"), schemaVersion=VERSION)
     _administrative(_add(root, "administrativeData"), c)
-    _measured(_add(root, "measurementResults"), c)
+    _measurement(_add(root, "measurementResults"), c)
     ET.indent(root)
     body: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
     signed = signer.sign({"xml": body})
@@ -72,8 +72,7 @@ def _administrative(data: ET.Element, c: ResultCertificate) -> None:
     _add(core, "performanceLocation", s.place.kind)
     _add(core, "issueDate", s.dates.issued)
     item = _add(_add(data, "items"), "item")
-    i = s.instrument
-    _instrument(item, i.name, i.manufacturer, i.model, i.serial_number, None)
+    _instrument(item, s.instrument, None)
     laboratory = _add(data, "calibrationLaboratory")
     _contact(_add(laboratory, "contact"), s.organisation)
     person = _add(_add(data, "respPersons"), "respPerson")
@@ -112,7 +111,7 @@ def _conformity(statements: ET.Element, c: ResultCertificate) -> None:
         _add(statement, "conformity", "pass" if verdict.conforms else "fail")
 
 
-def _measured(results: ET.Element, c: ResultCertificate) -> None:
+def _measurement(results: ET.Element, c: ResultCertificate) -> None:
     measured = _add(results, "measurementResult")
     _texts(measured, "name", "S and Q")
     method = _add(_add(measured, "usedMethods"), "usedMethod", refType="basic_calibrationMethod")
@@ -120,8 +119,8 @@ def _measured(results: ET.Element, c: ResultCertificate) -> None:
     _texts(method, "description", EQUATION)
     r = c.stated.reference
     equipment = _add(_add(measured, "measuringEquipments"), "measuringEquipment", refType="basic_referenceStandard")
-    _instrument(equipment, r.name, r.manufacturer, r.model, r.serial_number, c.reference_file,
-                f"{r.certificate_number} of {r.certificate_issuer}, {r.calibrated}")  # fmt: skip
+    named = f"{r.certificate_number} of {r.certificate_issuer}, {r.calibrated}"
+    _instrument(equipment, r, c.reference_file, named)
     _conditions(measured, c)
     listed = _add(measured, "results")
     known = np.flatnonzero(np.isfinite(c.result.values) & np.isfinite(c.result.expanded_uncertainty))
@@ -134,7 +133,7 @@ def _conditions(measured: ET.Element, c: ResultCertificate) -> None:
     kinds: list[tuple[str, str, Iterable[float] | None]] = [
         ("temperature", r"\degreecelsius", c.temperature_degc),
         ("band in which S holds", r"\hertz", c.result.frequencies.valid_band_hz),
-        ("frequency at which S holds", r"\hertz", _one(c.result.frequencies.reference_frequency_hz)),
+        ("frequency at which S holds", r"\hertz", _list_of_one(c.result.frequencies.reference_frequency_hz)),
         ("mean frequency of the motion", r"\hertz", c.frequency_hz or None),
         ("level of the motion, rms", UNITS["m/s²"], c.levels_mps2),
     ]
@@ -155,7 +154,7 @@ def _condition(conditions: ET.Element, name: str) -> ET.Element:
     return _add(condition, "data")
 
 
-def _one(value: float | None) -> list[float] | None:
+def _list_of_one(value: float | None) -> list[float] | None:
     return None if value is None else [value]
 
 
@@ -214,9 +213,10 @@ def _response(listed: ET.Element, c: ResultCertificate) -> None:
                 _list(_quantity(data, f"{name} {PARAMETERS[k]}"), values[:, k], unit)
 
 
-def _instrument(on: ET.Element, name: str, manufacturer: str, model: str, serial_number: str,
-                certificate: SourceFile | None, certificate_name: str = "") -> None:  # fmt: skip
-    _texts(on, "name", name)
+def _instrument(
+    on: ET.Element, instrument: Item | Reference, certificate: SourceFile | None, certificate_name: str = ""
+) -> None:
+    _texts(on, "name", instrument.name)
     if certificate is not None:
         held = _add(on, "certificate")
         _texts(held, "referral", certificate_name)
@@ -225,11 +225,11 @@ def _instrument(on: ET.Element, name: str, manufacturer: str, model: str, serial
         _add(held, "value", certificate.sha256)
     elif certificate_name:
         _texts(on, "description", f"certificate {certificate_name}")
-    _texts(_add(on, "manufacturer"), "name", manufacturer)
-    _add(on, "model", model)
+    _texts(_add(on, "manufacturer"), "name", instrument.manufacturer)
+    _add(on, "model", instrument.model)
     identification = _add(_add(on, "identifications"), "identification")
     _add(identification, "issuer", "manufacturer")
-    _add(identification, "value", serial_number)
+    _add(identification, "value", instrument.serial_number)
     _texts(identification, "name", "serial number")
 
 

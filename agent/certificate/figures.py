@@ -45,7 +45,7 @@ def figure(c: ResultCertificate, height_in: float, draw: Draw) -> Figure:
 
 
 def _main(on: FigureBase, c: ResultCertificate) -> None:
-    result = c.result.shown
+    result = c.result.in_display_units
     subplots = on.subplots(3, 1)
     for k, axes in enumerate(subplots):
         value, U = result.values[MAIN[k]], result.expanded_uncertainty[MAIN[k]]

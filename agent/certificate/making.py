@@ -42,7 +42,7 @@ def certificate_of(
     result = material.results[0]
     source = material.files[0].path if material.files else "the input"
     result = replace(result, unit=_unit(result.unit, stated.instrument.output_unit, source))
-    stated = _named(stated, result.fields.get("reference_quantity"))
+    stated = _with_reference_name(stated, result.fields.get("reference_quantity"))
     residuals, levels = tuple(seen), _levels(material)
     known = np.isfinite(result.values) & np.isfinite(result.expanded_uncertainty)
     if not any(np.isfinite(result.covariance[k][known]).all() for k in np.flatnonzero(known)):
@@ -55,7 +55,7 @@ def certificate_of(
         temperature_degc=_temperature(stated, material.history), frequency_hz=_frequencies(residuals),
         levels_mps2=(min(levels), max(levels)) if levels else None,
         positions=tuple(dict.fromkeys(w.position for w in result.windows if w.used and w.position)),
-        relative_pct=_relative(result), verdicts=_verdicts(result.shown, stated.decision),
+        relative_pct=_relative(result), verdicts=_verdicts(result.in_display_units, stated.decision),
         history=tuple(material.history), seen=residuals,
     )  # fmt: skip
     if found.number:
@@ -121,7 +121,7 @@ def _unit(told: str, stated: str, source: str) -> str:
     return told or named
 
 
-def _named(stated: CertificateStatements, quantity: object) -> CertificateStatements:
+def _with_reference_name(stated: CertificateStatements, quantity: object) -> CertificateStatements:
     """The statements with a name of the reference, by what it gives, where none is stated."""
     named = stated.reference.name or reference_name(quantity)
     return stated.model_copy(update={"reference": stated.reference.model_copy(update={"name": named})})

@@ -124,7 +124,7 @@ class Conditions(Section):
     other: Optional = ""
 
     @model_validator(mode="after")
-    def _both(self) -> Conditions:
+    def _check_temperatures(self) -> Conditions:
         low, high = self.temperature_low_degc, self.temperature_high_degc
         if (low is None) != (high is None):
             raise ValueError("temperature_low_degc and temperature_high_degc must be given together; add the other")

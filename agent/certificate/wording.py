@@ -93,7 +93,7 @@ def after_results(c: ResultCertificate) -> Iterator[CertificateSection]:
 
 def parameters(c: ResultCertificate) -> list[tuple[str, ...]]:
     """A row for each parameter, under HEADS."""
-    result = c.result.shown
+    result = c.result.in_display_units
     units = [sensitivity_unit(result.unit)] * 9 + [offset_unit(result.unit)] * 3
     return [
         (

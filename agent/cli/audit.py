@@ -94,7 +94,7 @@ def audit(
 
     files = files_or(data_dir, files, "FILE.mcap")
     try:
-        keys = _known(public_key, known_keys)
+        keys = _known_keys(public_key, known_keys)
         given = recordings_of(files)
         given.heads.extend(read_head(path) for path in heads)
         if witness is not None:
@@ -115,7 +115,7 @@ def audit(
     return run_audit(given, chosen, as_json=json_to is not None, strict=strict, keys=keys, jobs=jobs)
 
 
-def _known(public_key: Path | None, known_keys: Path | None) -> KnownKeys | None:
+def _known_keys(public_key: Path | None, known_keys: Path | None) -> KnownKeys | None:
     """The keys of the options; None where neither is given. Raises KeyFileError."""
     from agent.config.known_keys import KnownKeys, read_known_keys
     from agent.recording.signing import load_public_key
@@ -161,7 +161,7 @@ def run_audit(
 ) -> int:
     """Audit, print, and return the exit status. With `keys`, files must be signed by a key of their gateway."""
     try:
-        audited, links, gone = _audited(given, engines, strict=strict, keys=keys, jobs=jobs)
+        audited, links, gone = _audit(given, engines, strict=strict, keys=keys, jobs=jobs)
         end = check_end(given.heads, links, gone, keys, time.time_ns())
         end.reasons += [*given.faults, *gone.faults]
         end.unproven += [*unproven(links, gone.statements, whole=gone.whole), *gone.unproven]
@@ -197,10 +197,10 @@ def audit_files(
     given: GivenFiles, engines: Engines, *, strict: bool = False, keys: KnownKeys | None = None
 ) -> list[AuditedFile]:
     """The verdict on each file. Each file is also compared with the one before it. Raises OSError."""
-    return _audited(given, engines, strict=strict, keys=keys, jobs=1)[0]
+    return _audit(given, engines, strict=strict, keys=keys, jobs=1)[0]
 
 
-def _audited(
+def _audit(
     given: GivenFiles, engines: Engines, *, strict: bool, keys: KnownKeys | None, jobs: int
 ) -> tuple[list[AuditedFile], list[ChainLink], Gone]:
     """(the verdicts, the links of the chain, what is known of recordings that are not there)."""

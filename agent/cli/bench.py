@@ -6,7 +6,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,7 +14,16 @@ import click
 import numpy as np
 
 from agent.cli.finite import Finite
-from agent.cli.led import ask, check_stated, made, opened, parsed, progress, with_filters
+from agent.cli.leading import (
+    ask,
+    calibrate_options,
+    check_stated,
+    make_result,
+    progress,
+    say_fault,
+    wait_for_devices,
+    with_filters,
+)
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
 from agent.terminal.text import say
 
@@ -91,21 +100,11 @@ def bench(
     try:
         if config is None:
             with _virtual_bench(virtual, seed, routers) as (settings, turn):  # type: ignore[arg-type]
-                return _session(settings, settings.channels[0], output, options, turn)
+                return _session(_Bench(settings, settings.channels[0], output, options, turn))
         settings = load_config(config)
-        return _session(settings, _channel(settings, sensor, config), output, options, None)
-    except ConfigError as error:
-        for fault in error.faults:
-            say(fault, err=True)
-        return 2
-    except ValueError as error:
-        say(f"fieldcal bench: {error}", err=True)
-        return 2
-    except FileExistsError:
-        say(f"fieldcal bench: {output} exists; name a new directory with -o", err=True)
-        return 2
-    except OSError as error:
-        say(f"fieldcal bench: {error.filename or output}: {error.strerror}", err=True)
+        return _session(_Bench(settings, _channel(settings, sensor, config), output, options, None))
+    except (ConfigError, ValueError, OSError) as error:
+        say_fault(error, "bench", output, "-o")
         return 2
 
 
@@ -119,16 +118,27 @@ def _channel(settings: Config, sensor: str | None, path: Path) -> Channel:
     return found[0]
 
 
-def _session(settings: Config, channel: Channel, output: Path, options: dict[str, Any], turn: Turn | None) -> int:
-    if output.exists():
+@dataclass(frozen=True)
+class _Bench:
+    """What is calibrated, with which options, and where its files go. `turn` turns the sensor of a virtual bench."""
+
+    settings: Config
+    channel: Channel
+    output: Path
+    options: dict[str, Any]
+    turn: Turn | None
+
+
+def _session(bench: _Bench) -> int:
+    if bench.output.exists():
         raise FileExistsError
-    if options["stated"] is not None:
-        check_stated(options["stated"])
-    publisher = _publisher(settings)
+    if bench.options["stated"] is not None:
+        check_stated(bench.options["stated"])
+    publisher = _publisher(bench.settings)
     if publisher is None:
-        return _led(settings, channel, output, options, turn, lambda _: None)
+        return _lead(bench, lambda _: None)
     with publisher:
-        return _led(settings, channel, output, options, turn, publisher.show)
+        return _lead(bench, publisher.show)
 
 
 def _publisher(settings: Config) -> GuidePublisher | None:
@@ -149,49 +159,43 @@ def _publisher(settings: Config) -> GuidePublisher | None:
         return None
 
 
-def _led(
-    settings: Config,
-    channel: Channel,
-    output: Path,
-    options: dict[str, Any],
-    turn: Turn | None,
-    publish: Callable[[Guide], None],
-) -> int:
+def _lead(bench: _Bench, publish: Callable[[Guide], None]) -> int:
     """Lead through the positions, and make the result."""
     from agent.bench.capture import Capture
-    from agent.bench.kinds import stated, stops_of, write_prior
+    from agent.bench.kinds import stated_options, stops_of, write_prior
     from agent.bench.measuring import Measuring
-    from agent.bench.screen import BenchScreen
+    from agent.bench.screen import BenchScreen, Person
     from agent.calibrate.stated import options_of
     from calib.visit.next_stop import WantedUncertainty
 
+    channel, output, options = bench.channel, bench.output, bench.options
     stops = stops_of(channel, options["thetas"], options["alphas"])
     devices = [channel.sensor, *([channel.reference] if channel.reference else [])]
     wanted, status = WantedUncertainty(options["u_main_pct"] / 100.0, options["u_transverse_pct"] / 100.0), 1
-    screen = BenchScreen(channel.sensor, wanted, ask, say, progress, publish)
+    screen = BenchScreen(channel.sensor, wanted, Person(ask, say, progress), publish)
     try:
-        with Capture(settings, devices) as capture:
-            info = opened(capture, devices)
+        with Capture(bench.settings, devices) as capture:
+            info = wait_for_devices(capture, devices)
             channel = with_filters(channel, capture)
             output.mkdir(parents=True)
             scale = write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
-            arguments = [*stated(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
-            told = parsed(arguments)
+            arguments = [*stated_options(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
+            told = calibrate_options(arguments)
             measuring = Measuring(channel, options_of(told))
-            session = _begun(stops, measuring, wanted, scale, capture)
-            if not _measured(session, measuring, capture, screen, output, options, turn, arguments):
+            session = _begin(stops, measuring, wanted, scale, capture)
+            if not _measure(bench, session, measuring, capture, screen, arguments):
                 (output / "prior.json").unlink()
                 output.rmdir()
                 say("no stop was taken, so there is no result", err=True)
                 status = 3
                 return status
-        status = made(told, output, options["stated"])
+        status = make_result(told, output, options["stated"])
         return status
     finally:
-        screen.ended(output, status)
+        screen.show_end(output, status)
 
 
-def _begun(
+def _begin(
     stops: list[BenchStop], measuring: Measuring, wanted: WantedUncertainty, scale: float, capture: Capture
 ) -> BenchSession:
     """A session that knows how much the reference moves."""
@@ -204,30 +208,24 @@ def _begun(
     return BenchSession(stops, measuring.priors, wanted, scale, expected)
 
 
-def _measured(
-    session: BenchSession,
-    measuring: Measuring,
-    capture: Capture,
-    screen: BenchScreen,
-    output: Path,
-    options: dict[str, Any],
-    turn: Turn | None,
+def _measure(
+    bench: _Bench, session: BenchSession, measuring: Measuring, capture: Capture, screen: BenchScreen,
     arguments: list[str],
-) -> bool:
+) -> bool:  # fmt: skip
     """Whether stops were taken; their samples are then in the directory, also after Ctrl-C."""
     from agent.bench.aside import Aside
     from agent.bench.dialogue import Dialogue, StopStay
     from agent.bench.thinking import Thinking
 
-    stay = StopStay(options["stay_s"], max(options["most_s"], options["stay_s"]))
+    stay = StopStay(bench.options["stay_s"], max(bench.options["most_s"], bench.options["stay_s"]))
     with Aside() as aside:
-        dialogue = Dialogue(Thinking(session, measuring, aside), capture, stay, screen, turn)
+        dialogue = Dialogue(Thinking(session, measuring, aside), capture, stay, screen, bench.turn)
         try:
             dialogue.run()
         finally:
             if dialogue.taken:
                 time.sleep(measuring.margin_s)  # for the samples that filters need after a stop
-                measuring.write(capture.record(), dialogue.taken, output)
+                measuring.write(capture.record(), dialogue.taken, bench.output)
                 say("the samples are kept; the result is made by: fieldcal calibrate " + shlex.join(arguments))
     return bool(dialogue.taken)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,24 +43,32 @@ def certificate(inputs: tuple[Path, ...], data_dir: Path | None, output: Path, *
 
     Exit status 3 if the data were refused: then there is no certificate. 2 if the input cannot be used.
     """
-    return make(files_or(data_dir, inputs, "INPUT"), output, **options)
+    return make(files_or(data_dir, inputs, "INPUT"), output, CertificateOptions(**options))
 
 
-def make(
-    inputs: Sequence[Path],
-    output: Path,
-    *,
-    stated: Path | None,
-    entries: Sequence[str] = (),
-    key: Path | None = None,
-    x509_key: Path | None = None,
-    x509_certificate: Path | None = None,
-    xsd: Path | None = None,
-    sensor: str | None = None,
-) -> int:
+@dataclass(frozen=True, kw_only=True)
+class CertificateOptions:
+    """The values of the options."""
+
+    stated: Path | None
+    entries: Sequence[str] = ()
+    key: Path | None = None
+    x509_key: Path | None = None
+    x509_certificate: Path | None = None
+    xsd: Path | None = None
+    sensor: str | None = None
+
+    @property
+    def x509(self) -> tuple[Path, Path] | None:
+        """Key and certificate. Raises click.UsageError where one of them is missing."""
+        if (self.x509_key is None) != (self.x509_certificate is None):
+            raise click.UsageError("--x509-key and --x509-certificate must be given together")
+        return (self.x509_key, self.x509_certificate) if self.x509_key and self.x509_certificate else None
+
+
+def make(inputs: Sequence[Path], output: Path, options: CertificateOptions) -> int:
     """Make a certificate of `inputs` in the directory `output`, and say so; the exit status of the command."""
-    if (x509_key is None) != (x509_certificate is None):
-        raise click.UsageError("--x509-key and --x509-certificate must be given together")
+    stated, x509_files = options.stated, options.x509
     if not drawable():
         return 1
     from agent.certificate.content import CertificateError
@@ -73,19 +82,21 @@ def make(
     from agent.setup.asking import Interview
 
     try:
-        private = None if key is None else load_private_key(key)
-        x509 = X509Signer.load(x509_key, x509_certificate) if x509_key and x509_certificate else None
-        material = gather(inputs, sensor)
+        private = None if options.key is None else load_private_key(options.key)
+        x509 = X509Signer.load(*x509_files) if x509_files else None
+        material = gather(inputs, options.sensor)
         if len(material.results) > 1:
             raise MaterialError("a certificate is of one result; give one RESULT.json")
         if material.results[0].refused:
-            return _refused(material.results[0].reasons)
-        told, text = gather_statements(stated, entries, Interview())
+            return _say_refusal(material.results[0].reasons)
+        told, text = gather_statements(stated, options.entries, Interview())
         beside = Path() if stated is None else stated.parent
-        written = write(certificate_of(material, told, beside, left_over(material)), output, private, xsd, x509)
-        written += _kept(text, output / "certificate.toml", stated)
+        written = write(certificate_of(material, told, beside, left_over(material)), output, private, options.xsd, x509)
+        written += _keep_statements(text, output / "certificate.toml", stated)
     except (ConfigError, KeyFileError, MaterialError, SchemaError, CertificateError, OSError) as error:
-        for line in _worded(error, f"{stated or '--state'}: " if isinstance(error, CertificateError) else "", output):
+        for line in _fault_lines(
+            error, f"{stated or '--state'}: " if isinstance(error, CertificateError) else "", output
+        ):
             say(f"fieldcal certificate: {line}", err=True)
         return 2
     for notice in material.notices:
@@ -95,13 +106,13 @@ def make(
     return 0
 
 
-def _refused(reasons: Sequence[str]) -> int:
+def _say_refusal(reasons: Sequence[str]) -> int:
     for reason in reasons:
         say(f"refused: {reason}", err=True)
     return 3
 
 
-def _worded(error: Exception, place: str, output: Path) -> list[str]:
+def _fault_lines(error: Exception, place: str, output: Path) -> list[str]:
     if isinstance(error, OSError):
         return [f"{error.filename or output}: {error.strerror}"]
     return [f"{place}{error}"] if place else str(error).splitlines()
@@ -118,7 +129,7 @@ def drawable() -> bool:
     return True
 
 
-def _kept(text: str, path: Path, stated: Path | None) -> list[Path]:
+def _keep_statements(text: str, path: Path, stated: Path | None) -> list[Path]:
     """Write the statements into the directory of the certificate, but not over the file that states the others."""
     if not text or (stated is not None and stated.resolve() == path.resolve()):
         return []

@@ -11,11 +11,11 @@ from typing import Any
 
 import click
 
-from agent.bench.plan_told import ChannelPlan, shortcomings
+from agent.bench.plan_line import ChannelPlan, shortcomings
 from agent.config import Config, ConfigError
 from agent.config.broker import broker_warning
-from agent.config.faults import shown
-from agent.config.reading import parse_config, read_toml, refused
+from agent.config.faults import path_text
+from agent.config.reading import config_error, parse_config, read_toml
 from agent.config.tls import expiry_warning
 from agent.setup.contradictions import small_uncertainties
 from agent.setup.device_checks import answer_findings, loaded_options, missing_ports, sharing_findings
@@ -52,7 +52,7 @@ def check(config: Path, json_to: str | None) -> int:
         loaded = parse_config(raw, str(config), text)
         faults, plans = shortcomings(loaded)
         if faults:
-            raise refused(faults, str(config), text)
+            raise config_error(faults, str(config), text)
         answers = _answers(config, loaded)
     except ConfigError as error:
         if json_to:
@@ -63,7 +63,7 @@ def check(config: Path, json_to: str | None) -> int:
         return 2
     warnings = [*_warnings(config, loaded), *(f"{a.says}; {a.remedy}" for a in answers if a.verdict != "good")]
     unplaced = [told for one in plans for told in one.unplaced]
-    doubts = [f"{config}: {shown(place)}: {what}" for place, what in (*unplaced, *small_uncertainties(loaded))]
+    doubts = [f"{config}: {path_text(place)}: {what}" for place, what in (*unplaced, *small_uncertainties(loaded))]
     warnings += doubts
     filters = list(stated_filters(loaded))
     if json_to:
@@ -73,7 +73,7 @@ def check(config: Path, json_to: str | None) -> int:
     for warning in warnings:
         say(warning, err=True)
     verdict = "no fault, but what is told of it must be right before `fieldcal run` can calibrate" if doubts else "good"
-    say(f"{config}: {verdict}; {_counted(loaded)}")
+    say(f"{config}: {verdict}; {_summary(loaded)}")
     for line in _details(plans, filters, answers):
         say(f"  {line}")
     return 0
@@ -84,8 +84,8 @@ def _details(
 ) -> Iterable[str]:
     """Each line once: what positions determine, which filters are divided out, and what answers."""
     answered = [a.says for a in answers if a.verdict == "good"]
-    planned = [one.told for one in plans if one.told]
-    return dict.fromkeys([*planned, *(one.told for one in filters), *answered])
+    planned = [one.line for one in plans if one.line]
+    return dict.fromkeys([*planned, *(one.line for one in filters), *answered])
 
 
 def _counts(config: Config) -> dict[str, int]:
@@ -107,7 +107,7 @@ def _as_object(config: Config, filters: Sequence[StatedFilters], plans: Sequence
     }
 
 
-def _counted(config: Config) -> str:
+def _summary(config: Config) -> str:
     """What a configuration has, in words."""
     counts = _counts(config)
     told = [counted(count, name) for name, count in counts.items() if count or name in ("devices", "channels")]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
 import msgspec
 
-from agent.cli.tls_options import tls_files, tls_options
+from agent.cli.tls_options import TlsOptions, tls_options
 from agent.commanding.arguments import Arguments, Verb, parse_arguments
 from agent.commanding.desk import LONGEST_VALIDITY_S
 from agent.commanding.envelope import Order, as_line, seal
@@ -24,6 +25,20 @@ from agent.keys.files import SigningKey, read_signing_key
 from agent.terminal.text import say
 
 VALID_S = 60.0  # s; a command takes effect when it arrives, or not at all
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CommonOptions:
+    """The values of the options that all commands have."""
+
+    sensor: str
+    key_file: Path
+    data_dir: Path
+    connect: tuple[str, ...]
+    gateway: str | None
+    printed: bool
+    tls: TlsOptions
+    valid_s: float
 
 
 class _CommandAnswer(msgspec.Struct):
@@ -81,7 +96,7 @@ def pose(
     """Tell the agent the sensor's position from now on."""
     given = {"theta_deg": theta_deg, "alpha_deg": alpha_deg, "direction": direction, "gravity_mps2": gravity_mps2,
              "position": position}  # fmt: skip
-    return _run("pose", {name: value for name, value in given.items() if value is not None}, **options)
+    return _run("pose", {name: value for name, value in given.items() if value is not None}, _CommonOptions(**options))
 
 
 @command.command()
@@ -89,7 +104,7 @@ def pose(
 @common_options
 def hold(release: bool, **options: Any) -> int:
     """Keep the calibration in force unchanged until `hold --release`."""
-    return _run("hold", {"release": True} if release else {}, **options)
+    return _run("hold", {"release": True} if release else {}, _CommonOptions(**options))
 
 
 @command.command()
@@ -97,7 +112,7 @@ def hold(release: bool, **options: Any) -> int:
 @common_options
 def accept(sequence: int, **options: Any) -> int:
     """Bring an estimate into force."""
-    return _run("accept", {"sequence": sequence}, **options)
+    return _run("accept", {"sequence": sequence}, _CommonOptions(**options))
 
 
 @command.command()
@@ -105,52 +120,38 @@ def accept(sequence: int, **options: Any) -> int:
 @common_options
 def rollback(sequence: int, **options: Any) -> int:
     """Bring an earlier calibration into force again."""
-    return _run("rollback", {"sequence": sequence}, **options)
+    return _run("rollback", {"sequence": sequence}, _CommonOptions(**options))
 
 
-def _run(
-    verb: Verb,
-    given: dict[str, Any],
-    *,
-    sensor: str,
-    key_file: Path,
-    data_dir: Path,
-    connect: tuple[str, ...],
-    gateway: str | None,
-    printed: bool,
-    ca: str | None,
-    certificate: str | None,
-    certificate_key: str | None,
-    valid_s: float,
-) -> int:
-    if not CHUNK.fullmatch(sensor):
+def _run(verb: Verb, given: dict[str, Any], options: _CommonOptions) -> int:
+    if not CHUNK.fullmatch(options.sensor):
         raise click.BadParameter(
-            f"{sensor!r} cannot be the name of a sensor: 1 to 63 ASCII letters, digits, '-', '_', '.'",
+            f"{options.sensor!r} cannot be the name of a sensor: 1 to 63 ASCII letters, digits, '-', '_', '.'",
             param_hint="--sensor",
         )
     try:
         arguments = parse_arguments(verb, msgspec.json.encode(given))
-        key = read_signing_key(key_file)
+        key = read_signing_key(options.key_file)
     except (Refused, KeyFileError) as error:
         raise click.UsageError(str(error)) from None
-    if printed and connect:
+    if options.printed and options.connect:
         raise click.UsageError("--print sends nothing; leave --connect out")
-    files = tls_files(connect, ca, certificate, certificate_key)
+    files = options.tls.files(options.connect)
 
     def sealed(to: str) -> bytes:
-        return _sealed(key, to, sensor, verb, arguments, valid_s)
+        return _seal(key, to, options.sensor, verb, arguments, options.valid_s)
 
-    if printed:
-        say(as_line(sealed(_gateway_name(gateway))))
+    if options.printed:
+        say(as_line(sealed(_gateway_name(options.gateway))))
         return 0
-    address = f"{sensor}/command/{verb}"
+    address = f"{options.sensor}/command/{verb}"
     try:
-        if connect:
-            name = _gateway_name(gateway)
-            said = send(connect, files, f"{gateway_key(*name.split('/'))}/{address}", sealed(name))
+        if options.connect:
+            name = _gateway_name(options.gateway)
+            said = send(options.connect, files, f"{gateway_key(*name.split('/'))}/{address}", sealed(name))
         else:
-            with LocalAgent(data_dir) as agent:
-                said = agent.send(address, sealed(gateway or agent.gateway))
+            with LocalAgent(options.data_dir) as agent:
+                said = agent.send(address, sealed(options.gateway or agent.gateway))
         answer = msgspec.json.decode(said, type=_CommandAnswer)
     except EndpointError as error:
         raise click.UsageError(str(error)) from None
@@ -160,7 +161,7 @@ def _run(
     if not answer.taken:
         say(f"refused: {answer.reason}", err=True)
         return 3
-    say(f"taken: {verb} of {sensor}")
+    say(f"taken: {verb} of {options.sensor}")
     return 0
 
 
@@ -173,6 +174,6 @@ def _gateway_name(gateway: str | None) -> str:
     return gateway
 
 
-def _sealed(key: SigningKey, gateway: str, sensor: str, verb: Verb, arguments: Arguments, valid_s: float) -> bytes:
+def _seal(key: SigningKey, gateway: str, sensor: str, verb: Verb, arguments: Arguments, valid_s: float) -> bytes:
     now_ns = time.time_ns()
     return seal(Order.of(gateway, sensor, verb, arguments, now_ns, now_ns + int(valid_s * 1e9)), key.key_id, key.key)

@@ -12,9 +12,9 @@ from typing import Any
 
 import click
 
-from agent.bench.plan_told import shortcomings
+from agent.bench.plan_line import shortcomings
 from agent.config import Config, ConfigError, load_config
-from agent.config.faults import shown
+from agent.config.faults import path_text
 from agent.delivery.history import FILE_NAME, History, StoreError
 from agent.setup import device_checks, key_checks, machine_checks
 from agent.setup.finding import Finding
@@ -76,7 +76,7 @@ def _findings(path: Path | None, data_dir: Path, measure_s: float | None) -> Ite
     if config is not None:
         yield from device_checks.answer_findings(config, options)
         for place, what in shortcomings(config)[0]:
-            yield Finding("configuration", "fault", f"{shown(place)}: {what}", "`fieldcal check` names its line")
+            yield Finding("configuration", "fault", f"{path_text(place)}: {what}", "`fieldcal check` names its line")
         yield from device_checks.sharing_findings(config, options)
         yield from _throughput(config, options, data_dir, measure_s)
     yield from machine_checks.disk_findings(config, options, data_dir)
@@ -93,14 +93,14 @@ def _throughput(
 ) -> Iterator[Finding]:
     """The rates of the devices: measured now, or as the running agent has them."""
     if agent_runs(data_dir):
-        yield from _told_rates(config, data_dir)
+        yield from _measured_rates(config, data_dir)
     elif measure_s is not None:
         yield from device_checks.measured_findings(config, options, measure_s)
     else:
         yield Finding("throughput", "good", "not measured", "`--measure 5` reads the devices for 5 s")
 
 
-def _told_rates(config: Config, data_dir: Path) -> Iterator[Finding]:
+def _measured_rates(config: Config, data_dir: Path) -> Iterator[Finding]:
     """The rates that the running agent has measured, from its newest results `clock`."""
     told: dict[str, dict[str, Any]] = {}
     try:

@@ -39,13 +39,13 @@ def list_engines(directories: tuple[Path, ...], data_dir: Path | None, json_to: 
     SHA-256.
     """
     from agent.engine.identity import name
-    from agent.engine.known import known_engines, told_of
+    from agent.engine.known import description, known_engines
     from agent.engine.wheel import ENGINES
 
     places = [
         inner if (inner := place / ENGINES).is_dir() else place for place in (*directories, *filter(None, [data_dir]))
     ]
-    files = [told_of(path) for place in places for path in sorted(place.iterdir())[:MOST_LISTED]]
+    files = [description(path) for place in places for path in sorted(place.iterdir())[:MOST_LISTED]]
     if json_to:
         known = [release._asdict() for release in known_engines()]
         click.echo(json.dumps({"running": name(), "known": known, "files": files}))

@@ -104,12 +104,12 @@ def export(
         for why, number in content.left_out.items():
             say(f"fieldcal export: {number} samples have no acceleration: {why}", err=True)
     except (ExportError, StoreError, WatchError, OSError) as error:
-        say(f"fieldcal export: {_worded(error, to or mcap)}", err=True)
+        say(f"fieldcal export: {_fault_line(error, to or mcap)}", err=True)
         return 2
     return 0
 
 
-def _worded(error: Exception, written: Path | None) -> str:
+def _fault_line(error: Exception, written: Path | None) -> str:
     if isinstance(error, FileExistsError):
         return f"{error.filename}: the file exists; remove it, or choose another name"
     return f"{error.filename or written}: {error.strerror}" if isinstance(error, OSError) else str(error)

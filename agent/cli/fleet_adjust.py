@@ -10,7 +10,7 @@ import click
 from agent.cli.calibrate import calibrate
 from agent.config.reading import ConfigError
 from agent.fleet.adjusting import Adjusted, adjusted
-from agent.fleet.meeting import Meeting, device, met, stated
+from agent.fleet.meeting import Meeting, device, meeting_of, stated_calibration
 from agent.fleet.recorded import meetings_in
 from agent.fleet.site_file import SiteSection, arguments_of, load_site
 from agent.fleet.telling import as_json, as_object, reasons, show, write
@@ -80,7 +80,7 @@ def _met_in(sources: Sequence[Path]) -> tuple[list[SiteDevice], list[Meeting]]:
     if len(sources) > 1:
         raise TableError(f"{described[0]}: the file of a site stands alone; name the recordings in it")
     site, directory = load_site(described[0]), described[0].parent
-    meetings = [_met(site, k, directory) for k in range(len(site.links))]
+    meetings = [_meeting(site, k, directory) for k in range(len(site.links))]
     return [device(name, section, directory, meetings) for name, section in site.devices.items()], meetings
 
 
@@ -90,12 +90,12 @@ def _adjusted(devices: Sequence[SiteDevice], meetings: Sequence[Meeting]) -> Adj
     return adjusted(devices, meetings)
 
 
-def _met(site: SiteSection, k: int, directory: Path) -> Meeting:
+def _meeting(site: SiteSection, k: int, directory: Path) -> Meeting:
     one = site.links[k]
     try:
         context = calibrate.make_context(f"links.{k}", arguments_of(site, one, directory))
-        known = stated(site.devices[one.reference], directory) if one.reference else None
-        return met(one.sensor, one.reference, context.params, known)
+        known = stated_calibration(site.devices[one.reference], directory) if one.reference else None
+        return meeting_of(one.sensor, one.reference, context.params, known)
     except click.ClickException as error:
         raise TableError(f"links.{k}: {error.format_message()}") from None
     except TableError as error:

@@ -50,7 +50,7 @@ def replay(
     """
     from agent.fleet.results import results_of
     from agent.fleet.settings import ChangedSetting, SettingError
-    from agent.fleet.sources import SourceError, found
+    from agent.fleet.sources import SourceError, recordings_in
     from agent.fleet.workers import DaskWorkers, LocalWorkers, SchedulerError
 
     if scheduler is not None and workers is not None:
@@ -60,7 +60,7 @@ def replay(
     try:
         for text in settings:
             ChangedSetting.of(text)
-        places = found(recordings)
+        places = recordings_in(recordings)
         if directory is not None:
             directory.mkdir(parents=True, exist_ok=True)
         chosen = DaskWorkers(scheduler) if scheduler else LocalWorkers(workers or len(os.sched_getaffinity(0)))

@@ -35,13 +35,13 @@ def watch(files: tuple[Path, ...], beside_reference: tuple[str, ...], site: str 
     Exit status 0 if nothing has changed, 2 on bad input, 3 if a sensor, a gateway or the structure has changed.
     """
     from agent.site_watch.source import WatchError
-    from agent.site_watch.view import as_object, not_seen, rows, seen
+    from agent.site_watch.view import as_object, blind_spots, rows, watch_site
     from calib.recorded.outcome import plain
 
     try:
         with ExitStack() as stack:
             found = _source(files, site, stack)
-            told = seen(found, _positions(found, beside_reference))
+            told = watch_site(found, _positions(found, beside_reference))
     except (OSError, WatchError) as error:
         say(f"fieldcal fleet watch: {error}", err=True)
         return 2
@@ -55,7 +55,7 @@ def watch(files: tuple[Path, ...], beside_reference: tuple[str, ...], site: str 
             say("  ".join(f"{one_line(cell):<{width}}" for cell, width in zip(row, WIDTHS, strict=True)).rstrip())
         for line in told.sentences:
             say(one_line(line))
-        for line in not_seen(told):
+        for line in blind_spots(told):
             say(line)
     return 3 if told.changed else 0
 

@@ -185,7 +185,7 @@ def _write(path: Path, answers: tables.Answers, devices: list[ChosenDevice], key
         say(f"fieldcal init: {error}; --signing-key FILE.key states another file, --no-signing-key none", err=True)
         return 2
     for one in stated_filters(made):
-        say(one.told)
+        say(one.line)
     if pair is not None:
         _tell_key(pair)
     say(f"{path}: written; read it, then:")
@@ -219,7 +219,7 @@ def _devices(asking: Interview, given: dict[str, Any]) -> list[ChosenDevice]:
     """The sensor, and the reference if there is one."""
     roles: list[Role] = ["sensor"] if given["no_reference"] or given["mount"] == "rests" else ["sensor", "reference"]
     open_roles = [role for role in roles if not given[role] and not given[f"{role}_port"]]
-    found = _found() if open_roles else []
+    found = _probe_result() if open_roles else []
     used = {lasting_name(port) for port in (given[f"{role}_port"] for role in roles) if port}
     chosen = []
     for role in roles:
@@ -242,7 +242,7 @@ def _of_probe(role: Role, device: ProbedDevice, options: dict[str, SourcedValue[
     return ChosenDevice(role, SourcedValue(device.driver, source), of_probe | options)
 
 
-def _found() -> list[ProbedDevice]:
+def _probe_result() -> list[ProbedDevice]:
     """What the probe finds: chips on I2C, then serial ports of which the system knows something."""
     drivers = i2c_drivers()
     chips = [

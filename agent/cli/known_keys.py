@@ -24,7 +24,7 @@ def list_keys(known: Path) -> int:
     try:
         listed = read_known_keys(known)
     except KeyFileError as error:
-        return _refused(error)
+        return _say_refusal(error)
     for gateway, keys in sorted(listed.gateways.items()):
         for key in keys:
             revoked = f"  revoked: {listed.revoked[key]}" if key in listed.revoked else ""
@@ -47,7 +47,7 @@ def add(gateway: str, public_key: Path, known: Path) -> int:
         key = _of_file(public_key)
         add_key(known, gateway, key)
     except KeyFileError as error:
-        return _refused(error)
+        return _say_refusal(error)
     say(f"{known}: {gateway} signs with the key {identifier(key)}")
     return 0
 
@@ -68,7 +68,7 @@ def revoke(key: str, reason: str, known: Path) -> int:
         public_key = named[0] if named else public_key_of(key) or _of_file(Path(key))
         revoke_key(known, public_key, reason)
     except KeyFileError as error:
-        return _refused(error)
+        return _say_refusal(error)
     say(f"{known}: the key {identifier(public_key)} is revoked")
     return 0
 
@@ -79,6 +79,6 @@ def _of_file(path: Path) -> bytes:
     return load_public_key(path).public_bytes_raw()
 
 
-def _refused(error: KeyFileError) -> int:
+def _say_refusal(error: KeyFileError) -> int:
     say(f"fieldcal keys: {error}", err=True)
     return 2

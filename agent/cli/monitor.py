@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from agent.cli.tls_options import tls_files, tls_options
+from agent.cli.tls_options import TlsOptions, tls_options
 from agent.config.key_file import KeyFileError, read_private_key
 from agent.config.known_keys import read_known_keys
 from agent.config.reading import ConfigError
@@ -86,9 +86,7 @@ def monitor(
     behind_proxy: bool,
     command_certificate: str | None,
     command_key: str | None,
-    ca: str | None,
-    certificate: str | None,
-    certificate_key: str | None,
+    tls: TlsOptions,
 ) -> int:
     """Show all sensors of all gateways on one web page, until Ctrl-C. Exit status: 1 port or disk, 2 bad input."""
     try:
@@ -103,10 +101,8 @@ def monitor(
         return _add_user(users, add_user, verbs)
     host, port = _listen(listen)
     _check_https(host, users, https_certificate, https_key, behind_proxy)
-    bus = BusAccess(
-        endpoints=endpoints, tls=tls_files(endpoints, ca, certificate, certificate_key), keys=keys,
-        commander=tls_files(endpoints, ca, command_certificate or certificate, command_key or certificate_key),
-    )  # fmt: skip
+    commander = TlsOptions(tls.ca, command_certificate or tls.certificate, command_key or tls.certificate_key)
+    bus = BusAccess(endpoints=endpoints, tls=tls.files(endpoints), commander=commander.files(endpoints), keys=keys)
     web = Web(names=names, users=users, certificate=https_certificate, key=https_key, behind_proxy=behind_proxy)
     with ExitStack() as stack:
         try:

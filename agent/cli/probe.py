@@ -173,7 +173,7 @@ def _at(bus: int, address: int, drivers: dict[str, type[FifoSensor]], self_test:
     if not known:
         return ProbedAddress(address, note="; ".join(notes))
     sensor = next(iter(known.values()))
-    result = tested(sensor) if self_test else None
+    result = self_test_result(sensor) if self_test else None
     told = {"used_by": sensor.used_by(), "warning": sensor.must_be_alone}
     return ProbedAddress(address, list(known), " or ".join(identities), **told, self_test=result)
 
@@ -193,7 +193,7 @@ def on_spi(bus: str, drivers: dict[str, type[FifoSensor]], self_test: bool) -> S
     except DeviceError as error:
         return Selected(bus, name, note=str(error))
     used_by = sensor.used_by()
-    return Selected(bus, name, identity, used_by=used_by, self_test=tested(sensor) if self_test else None)
+    return Selected(bus, name, identity, used_by=used_by, self_test=self_test_result(sensor) if self_test else None)
 
 
 def _over_spi(driver: type[FifoSensor]) -> bool:
@@ -201,7 +201,7 @@ def _over_spi(driver: type[FifoSensor]) -> bool:
     return issubclass(model, FifoOptions) and model.spi is not None
 
 
-def tested(sensor: FifoSensor) -> dict[str, Any]:
+def self_test_result(sensor: FifoSensor) -> dict[str, Any]:
     """Result of the self-test, for JSON and for the printed lines."""
     try:
         sensor.open()

@@ -136,12 +136,12 @@ def serve(service: Service, duration_s: float | None) -> int:
 
 def _shortcomings(settings: Config) -> Iterator[str]:
     """Why nothing sound will be calibrated as it is stated. The agent runs all the same: it records."""
-    from agent.bench.plan_told import shortcomings
-    from agent.config.faults import shown
+    from agent.bench.plan_line import shortcomings
+    from agent.config.faults import path_text
 
     faults, plans = shortcomings(settings)
     for place, what in (*faults, *(told for one in plans for told in one.unplaced)):
-        yield f"{shown(place)}: {what}; `fieldcal check` names the line"
+        yield f"{path_text(place)}: {what}; `fieldcal check` names the line"
 
 
 def lateness_s() -> float:

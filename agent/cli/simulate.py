@@ -15,7 +15,7 @@ from click.core import ParameterSource
 from numpy.typing import NDArray
 
 from agent.cli.rules import check_rules
-from agent.cli.simulate_fleet import fleet_options, serve_fleet
+from agent.cli.simulate_fleet import FleetOptions, fleet_options, serve_fleet
 from agent.delivery.ending import StopRequest
 from agent.terminal.text import say
 from hw.virtual.bench import Bench, Truth
@@ -80,10 +80,10 @@ def simulate(
         if of_a_track or {preset, directory, play, rate_hz, axes, link} != {None}:
             raise click.UsageError("--fleet goes with --connect, --sensors, --every, --speed, --age, --keys, "
                                    "--truth, --seed and --duration only")  # fmt: skip
-        return serve_fleet(seed=seed, duration_s=duration_s, **fleet)
+        return serve_fleet(FleetOptions(**fleet), seed, duration_s)
     check_rules(
         (
-            not _given().isdisjoint(fleet),
+            not _given_options().isdisjoint(fleet),
             "--connect, --sensors, --every, --speed, --age, --keys and --truth need --fleet",
         ),
         ((preset is None) == (play is None), "give --preset, --play or --fleet"),
@@ -101,7 +101,7 @@ def simulate(
             return _serve_bench(bench, link)
         write_files(bench, directory, duration_s, {"preset": preset, "seed": seed})
     except (PlaybackError, FileExistsError, FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        say(_worded(error), err=True)
+        say(_fault_line(error), err=True)
         return 2
     say(
         f"fieldcal calibrate --sensor {directory}/sensor.csv --reference {directory}/reference.csv"
@@ -110,11 +110,11 @@ def simulate(
     return 0
 
 
-def _worded(error: Exception) -> str:
+def _fault_line(error: Exception) -> str:
     return f"{error.filename2 or error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
 
 
-def _given() -> set[str]:
+def _given_options() -> set[str]:
     """The names of the options on the command line."""
     context = click.get_current_context()
     return {name for name in context.params if context.get_parameter_source(name) == ParameterSource.COMMANDLINE}

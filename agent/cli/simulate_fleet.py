@@ -6,6 +6,7 @@ import json
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -48,11 +49,22 @@ def fleet_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def serve_fleet(
-    *, fleet: int, connect: str | None, sensors: int, every_s: float, speed: float, age_days: float,
-    keys: Path | None, truth: Path | None, seed: int, duration_s: float | None,
-) -> int:  # fmt: skip
-    """Act as `fleet` gateways, whose results have the time that runs `speed` times faster from `age_days` ago.
+@dataclass(frozen=True, kw_only=True)
+class FleetOptions:
+    """The values of the options: so many gateways, `fleet`, with so many `sensors` each."""
+
+    fleet: int
+    connect: str | None
+    sensors: int
+    every_s: float
+    speed: float
+    age_days: float
+    keys: Path | None
+    truth: Path | None
+
+
+def serve_fleet(options: FleetOptions, seed: int, duration_s: float | None) -> int:
+    """Act as many gateways, whose results have the time that runs `speed` times faster from `age_days` ago.
 
     Until Ctrl-C, or for `duration_s`. Returns the exit status: 1 without router or with too few files, 2 bad endpoint.
     """
@@ -62,15 +74,17 @@ def serve_fleet(
     from agent.config.known_keys import add_key
     from agent.delivery.router import DEFAULT_ENDPOINT
     from agent.delivery.session import EndpointError
+    from agent.fleet.simulated import FleetPlan
     from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses
 
-    endpoint, stop = connect or DEFAULT_ENDPOINT, StopRequest.by_signals()
+    fleet, sensors, keys = options.fleet, options.sensors, options.keys
+    endpoint, stop = options.connect or DEFAULT_ENDPOINT, StopRequest.by_signals()
     try:
         if fault := _files_fault(min(fleet, GATEWAYS_EACH)) or _router_fault(endpoint, stop):
             say(f"fieldcal simulate: {fault}", err=True)
             return 1
         with TemporaryDirectory(prefix="fieldcal-fleet-") as directory:
-            with FleetProcesses(fleet, sensors, seed, [endpoint], Path(directory), stop) as simulated:
+            with FleetProcesses(FleetPlan(fleet, sensors, seed, [endpoint], Path(directory)), stop) as simulated:
                 if simulated.unconnected:
                     say(f"fieldcal simulate: {simulated.unconnected} gateways found no router yet", err=True)
                 if keys is not None:
@@ -78,8 +92,8 @@ def serve_fleet(
                         add_key(keys, gateway.source, gateway.public_key)
                 say(f"{fleet} gateways with {sensors} sensors each at {endpoint}, seed {seed}")
                 _say_odd(simulated)
-                step = _step_of(simulated, stop, truth, seed)
-                results = _run(step, stop, every_s, speed, age_days, duration_s)
+                step = _step_of(simulated, stop, options.truth, seed)
+                results = _run(step, stop, options, duration_s)
             say(f"{results} results sent")
     except BrokenProcessPool:
         if not stop.is_set():
@@ -129,20 +143,17 @@ def _write_truth(path: Path, truth: dict[str, Any]) -> None:
     new.replace(path)
 
 
-def _run(
-    step: Callable[[int], int], stop: StopEvent, every_s: float, speed: float, age_days: float,
-    duration_s: float | None,
-) -> int:  # fmt: skip
+def _run(step: Callable[[int], int], stop: StopEvent, options: FleetOptions, duration_s: float | None) -> int:
     """Step until it is to stop; returns the number of results."""
     begun, results, rounds = time.monotonic(), 0, 0
-    first_utc_ns = time.time_ns() - round(age_days * DAY_S * 1e9)
+    first_utc_ns = time.time_ns() - round(options.age_days * DAY_S * 1e9)
     while not stop.is_set():
         passed_s = time.monotonic() - begun
         if duration_s is not None and passed_s > duration_s:
             break
-        results += step(min(first_utc_ns + round(passed_s * speed * 1e9), time.time_ns()))
+        results += step(min(first_utc_ns + round(passed_s * options.speed * 1e9), time.time_ns()))
         rounds += 1
-        stop.wait(max(0.0, begun + rounds * every_s - time.monotonic()))
+        stop.wait(max(0.0, begun + rounds * options.every_s - time.monotonic()))
     return results
 
 

@@ -17,7 +17,16 @@ import click
 import numpy as np
 
 from agent.cli.finite import Finite
-from agent.cli.led import ask, check_stated, made, opened, parsed, progress, with_filters
+from agent.cli.leading import (
+    ask,
+    calibrate_options,
+    check_stated,
+    make_result,
+    progress,
+    say_fault,
+    wait_for_devices,
+    with_filters,
+)
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
 from agent.terminal.text import say
 
@@ -78,18 +87,8 @@ def visit(config: Path | None, sensors: tuple[str, ...], json_to: Path | None, s
         if json_to is not None:
             with click.open_file(str(json_to), "w") as file:
                 file.write(json.dumps(told) + "\n")
-    except ConfigError as error:
-        for fault in error.faults:
-            say(fault, err=True)
-        return 2
-    except ValueError as error:
-        say(f"fieldcal visit: {error}", err=True)
-        return 2
-    except FileExistsError:
-        say(f"fieldcal visit: {options['data_dir']} exists; name a new directory with --data-dir", err=True)
-        return 2
-    except OSError as error:
-        say(f"fieldcal visit: {error.filename or options['data_dir']}: {error.strerror}", err=True)
+    except (ConfigError, ValueError, OSError) as error:
+        say_fault(error, "visit", options["data_dir"], "--data-dir")
         return 2
     return 0 if complete else 3
 
@@ -140,8 +139,9 @@ def _visit(
 ) -> dict[str, Any] | None:
     """One visit with its files and result; None where the person ends all."""
     from agent.bench.capture import Capture
-    from agent.bench.kinds import mounted, stated, write_prior
+    from agent.bench.kinds import mounted_stop, stated_options, write_prior
     from agent.bench.measuring import Measuring
+    from agent.bench.screen import Person
     from agent.bench.visit_dialogue import LEAST_STAY_S, VisitDialogue, VisitStay, forbidden
     from agent.bench.visiting import Visiting
     from agent.calibrate.stated import options_of
@@ -152,11 +152,11 @@ def _visit(
     output.mkdir()
     devices = [channel.sensor, channel.reference]
     with Capture(settings, devices) as capture:
-        info = opened(capture, devices)
+        info = wait_for_devices(capture, devices)
         write_prior(channel, info.get("nominal_sensitivity"), output / "prior.json")
         channel = with_filters(channel, capture)
-        arguments = [*stated(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
-        measuring = Measuring(channel, options_of(parsed(arguments)))
+        arguments = [*stated_options(channel, output, info.get("unit", "")), f"--json={output / 'result.json'}"]
+        measuring = Measuring(channel, options_of(calibrate_options(arguments)))
         across = options["u_transverse_pct"]
         wanted = WantedUncertainty(options["u_pct"] / 100.0, np.inf if across is None else across / 100.0)
         if why := forbidden(COVERAGE_FACTOR * measuring.priors.reference, wanted.main):
@@ -164,10 +164,10 @@ def _visit(
         stay_s = 60.0 * options["minutes"]
         dialogue = VisitDialogue(
             Visiting(measuring, wanted, aside), capture, VisitStay(min(LEAST_STAY_S, stay_s), stay_s),
-            _assent() if options["yes"] else partial(ask, err=options["apart"]), tell, progress,
+            Person(_assent() if options["yes"] else partial(ask, err=options["apart"]), tell, progress),
             None if clamp is None else partial(clamp, channel.sensor),
         )  # fmt: skip
-        visited = dialogue.run(mounted(channel))
+        visited = dialogue.run(mounted_stop(channel))
         if visited.taken is not None:
             time.sleep(measuring.margin_s)  # for the samples that filters need after the visit
             measuring.write(capture.record(visited.taken.start_s - measuring.margin_s), [visited.taken], output)
@@ -196,7 +196,7 @@ def _result(
     tell(f"  the samples are kept; the result is made by: fieldcal calibrate {shlex.join(arguments)}")
     to_error = contextlib.redirect_stdout(sys.stderr) if options["apart"] else contextlib.nullcontext()
     with to_error:
-        made(parsed(arguments), output, options["stated"])
+        make_result(calibrate_options(arguments), output, options["stated"])
     if not (output / "result.json").exists():  # the samples themselves could not be read; calibrate has said why
         return told | {"status": "refused", "reasons": [f"fieldcal calibrate does not take the samples in {output}"]}
     result = json.loads((output / "result.json").read_text())
@@ -205,7 +205,7 @@ def _result(
     if result["status"] == "valid":
         later = growth(channel, result, options["temperature_off_k"])
         limit_pct = options["limit_u_pct"] or 2.0 * options["u_pct"]
-        told["growth"] = later.told(limit_pct, datetime.now(UTC))
+        told["growth"] = later.as_object(limit_pct, datetime.now(UTC))
         _say_growth(told["growth"], tell)
     return told
 

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, RecoveryConfig, declare_advanced_subscriber
 
-from agent.cli.tls_options import tls_files, tls_options
+from agent.cli.tls_options import TlsOptions, tls_options
 from agent.config.key_file import KeyFileError
 from agent.config.known_keys import KnownKeys, WatchedKeys
 from agent.delivery.ending import StopRequest
@@ -57,9 +57,7 @@ def witness(
     key: str,
     public_keys: tuple[Path, ...],
     known_keys: Path | None,
-    ca: str | None,
-    certificate: str | None,
-    certificate_key: str | None,
+    tls: TlsOptions,
 ) -> int:
     """Keep the heads that gateways publish, with the time of this machine, signed with a key of this machine.
 
@@ -70,10 +68,10 @@ def witness(
     Exit status: 1 no router or a fault of the disk, 2 bad input.
     """
     stop = StopRequest.by_signals()
-    tls = tls_files(endpoints, ca, certificate, certificate_key)
+    files = tls.files(endpoints)
     try:
         kept = Witness(directory, _signer(directory), _keys(public_keys, known_keys), time.time_ns)
-        config = session_config("client", connect=endpoints, tls=tls)
+        config = session_config("client", connect=endpoints, tls=files)
     except (KeyFileError, EndpointError, WitnessError) as error:
         say(f"fieldcal witness: {error}", err=True)
         return 2
@@ -103,7 +101,7 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) 
 
     def take_all() -> None:
         try:
-            _take_all(subscriber, kept)
+            _keep_heads(subscriber, kept)
         except OSError as error:
             faults.append(error)
             stop.set()
@@ -130,7 +128,7 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) 
     return 1 if faults or not heard else 0
 
 
-def _take_all(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
+def _keep_heads(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
     """Take each head that comes, and say which are not kept. Raises OSError where a disk fails that is not full."""
     refused, silent_until_s = 0, -math.inf
     for sample in subscriber:

@@ -123,7 +123,7 @@ class CommandDesk:
         if order.counter <= last:
             raise Refused("replayed", f"its counter {order.counter} is not above {last}, the last one of this key")
         arguments = parse_arguments(order.verb, bytes(order.arguments))
-        kept = self._kept(order.sensor, arguments)
+        kept = self._rollback_calibration(order.sensor, arguments)
         if not self._taken.passes(time.monotonic()):
             raise Refused("too many", "too many commands; wait a few seconds and send it again")
         try:
@@ -167,7 +167,7 @@ class CommandDesk:
         if not rights.may(order.verb, order.sensor):
             raise Refused("no right", f"key {rights.id} has no right to send {order.verb} to {order.sensor}")
 
-    def _kept(self, sensor: str, arguments: Arguments) -> str:
+    def _rollback_calibration(self, sensor: str, arguments: Arguments) -> str:
         """The calibration that a rollback names, as JSON; "" for other commands.
 
         Raises Refused where the store does not have the calibration or estimate that the command names.

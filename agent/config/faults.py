@@ -19,7 +19,7 @@ from agent.config.names import Told, name_faults
 from agent.config.sinks import Mqtt, Tls
 from agent.config.tls import tls_faults
 from agent.config.whole import Config
-from agent.config.words import in_words, length_fault, may_be_truth, meant
+from agent.config.words import in_words, length_fault, may_be_truth, remedy
 from hw.sensor import DeviceError, Options, load_driver
 
 MOST_DEVICES = 100  # whose options are checked; more are a fault of their own
@@ -38,7 +38,7 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
         config = Config.model_validate(raw)
     except ValidationError as error:
         # The model looks at its names only when all else is sound; they are named here, and only once.
-        faults += told(error, raw, Config, but_of_the_whole=bool(named))
+        faults += model_faults(error, raw, Config, but_of_the_whole=bool(named))
     faults += named
     options = list(_options(raw, faults))
     faults += _unknown_sensitivities(raw, dict(options))
@@ -49,7 +49,7 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
     return config, faults
 
 
-def shown(path: Path) -> str:
+def path_text(path: Path) -> str:
     """A path as faults name it."""
     return _short(".".join(str(part) for part in path))
 
@@ -71,7 +71,7 @@ def _options(raw: Mapping[str, Any], faults: list[Told]) -> Iterator[tuple[str, 
         except FiltersError as error:
             faults.append((("devices", i, "options", "filters"), str(error)))
         except ValidationError as error:
-            faults += [(("devices", i, "options", *path), what) for path, what in told(error, options, model)]
+            faults += [(("devices", i, "options", *path), what) for path, what in model_faults(error, options, model)]
         except (Exception, SystemExit) as error:  # of a plug-in
             fault = f"driver {driver!r} fails on its options: {type(error).__name__}: {error}"
             faults.append((("devices", i, "driver"), fault))
@@ -183,7 +183,9 @@ def _of_length(path: Path, raw: Any, kind: type[BaseModel]) -> Told | None:
     return None
 
 
-def told(error: ValidationError, raw: Any, kind: type[BaseModel], *, but_of_the_whole: bool = False) -> Iterator[Told]:
+def model_faults(
+    error: ValidationError, raw: Any, kind: type[BaseModel], *, but_of_the_whole: bool = False
+) -> Iterator[Told]:
     """The faults that a model of this kind found in the values of a TOML file: where, and what is wrong."""
     faults = [fault for fault in error.errors() if fault["loc"] or not but_of_the_whole]
     # A list that is too short only because what is in it was refused is no fault of its own.
@@ -196,14 +198,14 @@ def told(error: ValidationError, raw: Any, kind: type[BaseModel], *, but_of_the_
         if len(said) >= SHOWN_FAULTS:
             yield path, ""  # only counted: to word tens of thousands takes minutes
             continue
-        path, what = _of_length(path, raw, kind) or _what(fault, path, kind)
+        path, what = _of_length(path, raw, kind) or _fault_of(fault, path, kind)
         if path in said and fault["type"] not in ("value_error", "extra_forbidden"):
             continue  # of alternatives that all do not fit, and of a list whose length is wrong, one fault is told
         said.add(path)
         yield path, what
 
 
-def _what(fault: Mapping[str, Any], path: Path, kind: type[BaseModel]) -> Told:
+def _fault_of(fault: Mapping[str, Any], path: Path, kind: type[BaseModel]) -> Told:
     """Where a fault of a model is, and what is wrong, with the value."""
     value, what = fault.get("input"), in_words(fault, path)
     if fault["type"] == "value_error" and (named := _PATH.match(what)) is not None:
@@ -211,7 +213,7 @@ def _what(fault: Mapping[str, Any], path: Path, kind: type[BaseModel]) -> Told:
     # A whole section as "the offending value" would bury the message.
     whole = isinstance(value, dict | BaseModel | list | tuple) or fault["type"] == "missing"
     if fault["type"] == "extra_forbidden":
-        return path, f"there is no such setting{'' if whole else f' ({_value(value)})'}; {meant(kind, path)}"
+        return path, f"there is no such setting{'' if whole else f' ({_value(value)})'}; {remedy(kind, path)}"
     if isinstance(value, str) and fault["type"] == "literal_error" and repr(value) not in what and _is_number(value):
         what += " as a number without quotes"
     return path, what if whole or (isinstance(value, str) and repr(value) in what) else f"{what}, not {_value(value)}"

@@ -59,7 +59,7 @@ class KnownKeys:
         known = map(identifier, (*self.gateways.get(gateway, ()), *self.anywhere))
         return f"signed with the key {key_id!r:.40}, not with {' or '.join(known)}"
 
-    def named(self, gateway: str, key_id: str) -> bytes | None:
+    def key_named(self, gateway: str, key_id: str) -> bytes | None:
         """The key of a gateway with this identifier; None where it has none such."""
         known = (*self.gateways.get(gateway, ()), *self.anywhere)
         return next((key for key in known if identifier(key) == key_id), None)

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from agent.config.faults import SHOWN_FAULTS, faults_of, shown, told
+from agent.config.faults import SHOWN_FAULTS, faults_of, model_faults, path_text
 from agent.config.files import read_file
 from agent.config.lines import lines_of
 from agent.config.names import Told
@@ -59,7 +59,7 @@ def check_model(raw: dict[str, Any], kind: type[Model], origin: str, text: str =
     try:
         return kind.model_validate(raw)
     except ValidationError as error:
-        raise refused(list(told(error, raw, kind)), origin, text) from None
+        raise config_error(list(model_faults(error, raw, kind)), origin, text) from None
 
 
 def read_toml(path: FilePath) -> tuple[dict[str, Any], str]:
@@ -83,7 +83,7 @@ def read_toml(path: FilePath) -> tuple[dict[str, Any], str]:
     except RecursionError:
         raise ConfigError([f"{path}: its tables or lists are nested too deep to be read"]) from None
     if too_large := size_faults(raw):
-        raise refused(too_large, str(path), text)
+        raise config_error(too_large, str(path), text)
     return raw, text
 
 
@@ -111,17 +111,17 @@ def parse_config(raw: dict[str, Any], origin: str, text: str = "") -> Config:
     """
     config, faults = faults_of(raw)
     if faults or config is None:
-        raise refused(faults, origin, text)
+        raise config_error(faults, origin, text)
     return config
 
 
-def refused(faults: list[Told], origin: str, text: str) -> ConfigError:
+def config_error(faults: list[Told], origin: str, text: str) -> ConfigError:
     """The error that tells these faults, each with its line where the text is known."""
     some = faults[:SHOWN_FAULTS]
     lines = lines_of(text, {path for path, _ in some}) if text else {}
     words = []
     for path, what in some:
         place = f"line {lines[path]}: " if text else ""
-        words.append(f"{origin}: {place}{f'{shown(path)}: ' if path else ''}{what}")
+        words.append(f"{origin}: {place}{f'{path_text(path)}: ' if path else ''}{what}")
     more = len(faults) - SHOWN_FAULTS
     return ConfigError(words + ([f"{origin}: and {more} more faults, not shown"] if more > 0 else []))

@@ -86,7 +86,7 @@ def may_be_truth(kind: type[BaseModel], path: Path) -> bool:
     return not types or any(one in (bool, Any) for one in types)
 
 
-def meant(kind: type[BaseModel], path: Path) -> str:
+def remedy(kind: type[BaseModel], path: Path) -> str:
     """What to do about a setting at `path` that a file of this kind does not have."""
     name, here = str(path[-1]), {field for model in _models(kind, path[:-1]) for field in model.model_fields}
     wanted = name.lower().replace("-", "_").replace(" ", "_")

@@ -38,7 +38,7 @@ def answer_queries(
         with query:  # without closing the query, the sender waits until its timeout
             try:
                 records, removed = _answers(query, gateway, open_store)
-                replied = _reply_told(query, gateway, told())
+                replied = _reply_status(query, gateway, told())
                 if removed:
                     query.reply_err(f"{REMOVED}{removed}")
                 elif not records and not replied:
@@ -61,7 +61,7 @@ def attachment_of(record: StoredResult, previous: str = "") -> bytes:
     return previous.encode() + (b"\n" + record.signed if record.signed else b"")
 
 
-def _reply_told(query: zenoh.Query, gateway: str, told: Mapping[str, bytes]) -> bool:
+def _reply_status(query: zenoh.Query, gateway: str, told: Mapping[str, bytes]) -> bool:
     wanted = {} if "after" in query.parameters else {result_key(gateway, "", what): told[what] for what in told}
     matching = {key: value for key, value in wanted.items() if query.key_expr.intersects(key)}
     for key, value in matching.items():

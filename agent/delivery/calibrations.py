@@ -5,7 +5,7 @@ from __future__ import annotations
 from agent.delivery.history import History, StoredResult
 
 
-def made(record: StoredResult) -> tuple[str, int]:
+def first_in_force(record: StoredResult) -> tuple[str, int]:
     """(run, sequence) of the result by which the calibration of this record first came into force."""
     fields = record.fields
     sequence = fields.get("made_sequence")
@@ -27,7 +27,7 @@ def calibrations(history: History, sensor: str, *, limit: int) -> list[StoredRes
         records = history.newest(sensor, "calibration", limit=asked)
         once: dict[tuple[str, int], StoredResult] = {}
         for record in records:
-            once.setdefault(made(record), record)
+            once.setdefault(first_in_force(record), record)
         if len(once) >= limit or len(records) < asked:
             break
         asked *= 2
@@ -36,7 +36,7 @@ def calibrations(history: History, sensor: str, *, limit: int) -> list[StoredRes
 
 
 def _first(history: History, record: StoredResult) -> StoredResult:
-    run_id, sequence = made(record)
+    run_id, sequence = first_in_force(record)
     found = history.after(sequence - 1, [(record.sensor, "calibration")], limit=1)
     there = bool(found) and (found[0].run_id, found[0].sequence) == (run_id, sequence)
     return found[0] if there else record

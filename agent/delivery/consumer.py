@@ -204,10 +204,10 @@ class Consumer:
 
     def _take(self, item: zenoh.Sample | Replies) -> Iterator[Received]:
         if isinstance(item, Replies):
-            yield from self._go_on(item.source, item.dialogue, answer_of(item.replies, self._received))
+            yield from self._go_on(item.source, item.dialogue, answer_of(item.replies, self._read_sample))
             return
         self._room.release()
-        if (result := self._received(item)[0]) is not None:
+        if (result := self._read_sample(item)[0]) is not None:
             yield from self._follow(result)
 
     def close(self) -> None:
@@ -301,7 +301,7 @@ class Consumer:
             for result in self._held.pop_later(source):
                 yield from self._follow(result)
 
-    def _received(self, sample: zenoh.Sample) -> tuple[Received | None, int]:
+    def _read_sample(self, sample: zenoh.Sample) -> tuple[Received | None, int]:
         """(the result, or None where it is none or is refused; the number that it claims, otherwise 0)."""
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
         parts = str(sample.key_expr), sample.payload.to_bytes(), attachment

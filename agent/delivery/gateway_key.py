@@ -16,6 +16,6 @@ class GatewayKey:
     signer: Signer
 
     @property
-    def known(self) -> KnownKeys:
+    def known_keys(self) -> KnownKeys:
         """The keys whose signatures count."""
         return self.signer.known

@@ -131,7 +131,7 @@ class History:
         With `keys`, the newest one that they signed, once the gateway has signed any.
         """
         found = [
-            self._one(sequence) or self._signed_before(sensor, what, sequence)
+            self._result(sequence) or self._signed_before(sensor, what, sequence)
             for sensor, what, sequence, withdrawn in self._latest()
             if not withdrawn
         ]
@@ -169,7 +169,7 @@ class History:
         rows = self._rows(
             "SELECT max(sequence) FROM results WHERE sensor = ? AND what = 'calibration' GROUP BY identity", sensor
         )
-        return {record.identity: record for (sequence,) in rows for record in self._one(sequence)}
+        return {record.identity: record for (sequence,) in rows for record in self._result(sequence)}
 
     def file_sequence(self) -> int:
         """The highest file number of all recordings, deleted ones included."""
@@ -200,7 +200,7 @@ class History:
     def _latest(self) -> list[tuple[Any, ...]]:
         return self._checked("SELECT sensor, what, sequence, withdrawn, crc FROM latest")
 
-    def _one(self, sequence: int) -> list[StoredResult]:
+    def _result(self, sequence: int) -> list[StoredResult]:
         """The result with this number; none where it is refused."""
         rows = self._joined("WHERE sequence = ?", sequence)
         if not rows:

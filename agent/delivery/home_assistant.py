@@ -43,17 +43,18 @@ def entities_of_sensor(prefix: str, topic: str, site: str, gateway: str, calibra
         "status": {"state_topic": f"{place}/status", "device_class": "enum", "options": STATUSES,
                    "value_template": "{{ value_json.status }}"},
         "calibrated": {"state_topic": f"{place}/calibration", "device_class": "timestamp",
-                       "value_template": _known(MADE, "value_json.t_utc_ns")},
+                       "value_template": _nullable(MADE, "value_json.t_utc_ns")},
     }  # fmt: skip
     for k, parameter in enumerate(PARAMETERS):
         value = f"sensitivity[{k // 3}][{k % 3}]" if k < 9 else f"offset[{k - 9}]"
         of_s = "" if unit == "m/s2" else f"{unit}/(m/s²)"
         shown = {"state_topic": f"{place}/calibration", "state_class": "measurement"}
         shown |= {"unit_of_measurement": of_s if k < 9 else unit} if (of_s if k < 9 else unit) else {}
-        found[parameter] = shown | {"value_template": _known(f"value_json.{value}")}
+        found[parameter] = shown | {"value_template": _nullable(f"value_json.{value}")}
         expanded = f"value_json.coverage_factor * value_json.standard_uncertainty[{k}]"
         found[f"U({parameter})"] = shown | {
-            "value_template": _known(expanded, f"value_json.standard_uncertainty[{k}]"), "entity_category": "diagnostic"
+            "value_template": _nullable(expanded, f"value_json.standard_uncertainty[{k}]"),
+            "entity_category": "diagnostic",
         }  # fmt: skip
         found[f"drift of {parameter}"] = {
             "state_topic": f"{place}/drift/{parameter}", "device_class": "enum", "options": VERDICTS,
@@ -62,7 +63,7 @@ def entities_of_sensor(prefix: str, topic: str, site: str, gateway: str, calibra
     return dict(_entity(prefix, topic, device, "sensor", name, config) for name, config in found.items())
 
 
-def _known(value: str, test: str = "") -> str:
+def _nullable(value: str, test: str = "") -> str:
     """A template of a value that may be null, or of a calibration that was withdrawn."""
     return f"{{{{ {value} if value_json is defined and {test or value} is not none else {UNKNOWN} }}}}"
 

@@ -106,7 +106,7 @@ class MqttPublisher:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="mqtt", daemon=True)
         if settings.home_assistant:
-            self._put_all(entities_of_gateway(settings.home_assistant, self._topic, site, gateway))
+            self._put_values(entities_of_gateway(settings.home_assistant, self._topic, site, gateway))
 
     def start(self) -> None:
         """Start publishing in a thread of its own."""
@@ -114,11 +114,11 @@ class MqttPublisher:
 
     def publish(self, record: StoredResult) -> None:
         """Publish a result, in place of an earlier one of its topic."""
-        self._put_all(self._values(record))
+        self._put_values(self._values(record))
 
     def tell_status(self, status: bytes) -> None:
         """Publish the gateway's status (JSON)."""
-        self._put_all({f"{self._topic}/status": status})
+        self._put_values({f"{self._topic}/status": status})
 
     def state(self) -> MqttState:
         """The present state, for the gateway's status."""
@@ -163,7 +163,7 @@ class MqttPublisher:
             values |= entities_of_sensor(self._settings.home_assistant, self._topic, *self._place, record)
         return values
 
-    def _put_all(self, values: dict[str, bytes], *, only_new: bool = False) -> None:
+    def _put_values(self, values: dict[str, bytes], *, only_new: bool = False) -> None:
         """Let these values be sent; with `only_new` those of topics that have none yet."""
         with self._mutex:
             for topic, value in values.items():
@@ -202,14 +202,14 @@ class MqttPublisher:
                     values |= self._values(record)
         except (StoreError, sqlite3.Error) as error:
             _log.warning("MQTT: results of earlier runs are not published: %s", error)
-        self._put_all(values, only_new=True)
+        self._put_values(values, only_new=True)
 
     @property
-    def _where(self) -> str:
+    def _address(self) -> str:
         return f"{self._settings.host}:{self._settings.port}"
 
     def _no_broker(self, error: Exception) -> str:
-        return f"{self._where}: what answers there is no broker of MQTT 5: {error!r}"
+        return f"{self._address}: what answers there is no broker of MQTT 5: {error!r}"
 
     def _serve(self) -> None:
         """Connect, and publish until the connection ends or `close` is called. Raises BrokerLostError."""
@@ -248,7 +248,7 @@ class MqttPublisher:
         try:
             client.connect(settings.host, settings.port, KEEP_ALIVE_S, clean_start=True)
         except (OSError, ValueError) as error:  # ValueError: a name that cannot be looked up
-            raise BrokerLostError(f"{self._where}: {_told(error)}") from None
+            raise BrokerLostError(f"{self._address}: {_fault_text(error)}") from None
         return client
 
     def _begin(self, client: Any) -> None:
@@ -265,7 +265,7 @@ class MqttPublisher:
         latest = time.monotonic() + ANSWER_S
         while self._answer is None:
             if time.monotonic() > latest:
-                raise BrokerLostError(f"{self._where}: the broker did not answer within {ANSWER_S:g} s")
+                raise BrokerLostError(f"{self._address}: the broker did not answer within {ANSWER_S:g} s")
             self._turn(client)
 
     def _turn(self, client: Any) -> None:
@@ -274,14 +274,14 @@ class MqttPublisher:
         if self._answer is not None and self._answer.value >= REFUSED:
             code = self._answer
             raise BrokerLostError(
-                f"{self._where}: the broker refuses the connection: {code}{REMEDIES.get(code.value, '')}"
+                f"{self._address}: the broker refuses the connection: {code}{REMEDIES.get(code.value, '')}"
             )
         if failed or self._ended is not None:
             unknown = (
                 f"no reason told; if this repeats, another program has the client_id {self._client_id!r}: {OWN_ID}"
             )
             why = unknown if self._ended is None else _reason(self._ended)
-            raise BrokerLostError(f"{self._where}: the connection to the broker ended: {why}")
+            raise BrokerLostError(f"{self._address}: the connection to the broker ended: {why}")
 
     def _send(self, client: Any) -> None:
         """Send waiting values as long as the broker acknowledges them."""
@@ -340,7 +340,7 @@ def _reason(code: Any) -> str:
     return f"{code}{REMEDIES.get(code.value, '')}"
 
 
-def _told(error: OSError | ValueError) -> str:
+def _fault_text(error: OSError | ValueError) -> str:
     """Why there is no connection, in words."""
     import ssl
 

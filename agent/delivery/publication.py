@@ -109,7 +109,7 @@ class Publisher:
         self._hearing = Hearing()
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
         self._other = ""  # what is said where another gateway has this name
-        looking = session_config("client", connect=connect, tls=tls), self._key, self._stop, self._tell_other
+        looking = session_config("client", connect=connect, tls=tls), self._key, self._stop, self._note_other_gateway
         self._name_watch = threading.Thread(target=watch_own_name, args=looking, name="own name", daemon=True)
 
     def start(self) -> None:
@@ -208,7 +208,7 @@ class Publisher:
             while not stopping:
                 stopping = self._stop.is_set()  # read first: the last round then sends all that was handed over
                 if self._find_router(session):
-                    self._send_told(session)
+                    self._send_status(session)
                     self._send_waiting(session, history)
                     self._send_blocks(session)
                 if self._hearing.lost():
@@ -216,7 +216,7 @@ class Publisher:
                 self._wake.wait(0 if stopping else self._poll_s)
                 self._wake.clear()
 
-    def _tell_other(self, words: str) -> None:
+    def _note_other_gateway(self, words: str) -> None:
         self._other = words
 
     def _find_router(self, session: zenoh.Session) -> bool:
@@ -228,7 +228,7 @@ class Publisher:
         self._connected = connected
         return connected
 
-    def _send_told(self, session: zenoh.Session) -> None:
+    def _send_status(self, session: zenoh.Session) -> None:
         for what, value in self._told.items():
             if value != self._told_put.get(what):
                 self._publisher(session, result_key(self._key, "", what), cached=1).put(value)

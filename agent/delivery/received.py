@@ -103,7 +103,7 @@ def _plain(key: str, address: Address, payload: bytes, previous: int | None, sig
     if not _is_bounded(fields, DEEPEST):
         return None
     calibration = result.calibration if isinstance(result, Estimate) else result
-    if isinstance(calibration, CalibrationUpdate) and not _has_its_shapes(calibration):
+    if isinstance(calibration, CalibrationUpdate) and not _has_shapes(calibration):
         return None
     sequence = fields.get("sequence")
     if type(sequence) is not int or not 0 <= sequence <= LARGEST_NUMBER or fields.get("sensor") != address.sensor:
@@ -124,7 +124,7 @@ def _is_bounded(value: Any, levels: int) -> bool:
     return True
 
 
-def _has_its_shapes(calibration: CalibrationUpdate) -> bool:
+def _has_shapes(calibration: CalibrationUpdate) -> bool:
     steady = calibration.sensitivity_at_0hz
     squares_3 = [square for square in (steady.sensitivity, steady.standard_uncertainty) if square]
     for band in calibration.response:

@@ -61,11 +61,11 @@ def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | N
     rows = connection.execute("SELECT sensor, what, count, up_to, crc FROM removed")
     removed = {(row[0], row[1]): row[3] for row in map(checked, rows)}
     for number, path in reversed(recordings(directory)):
-        if (found := _scanned(path)) is None:
+        if (found := _scan(path)) is None:
             continue
         if not recovered.file_sequence and first_event(path) is not None:  # without it the number is used again
             recovered.file_sequence = number
-            recovered.published = _published(found.metadata.get(FILE_METADATA, {}))
+            recovered.published = _last_published(found.metadata.get(FILE_METADATA, {}))
         missing = _missing(connection, records_of(path, found))
         missing = [r for r in missing if r.sequence > removed.get((r.sensor, r.what), 0) and _counts(path, r, keys)]
         insert_results(connection, [record.row for record in missing])
@@ -77,7 +77,7 @@ def recover(connection: sqlite3.Connection, directory: Path, keys: KnownKeys | N
     return recovered
 
 
-def _scanned(path: Path) -> ScannedFile | None:
+def _scan(path: Path) -> ScannedFile | None:
     """The file; None where it cannot be read. What of it cannot be used is in the log."""
     try:
         found = scan(path)
@@ -118,9 +118,9 @@ def find_recorded(directory: Path, name: str, sequence: int, key: GatewayKey) ->
         for record in records_of(path, scan(path)):
             if record.sequence != sequence:
                 continue
-            if record.signed and _counts(path, record, key.known):
+            if record.signed and _counts(path, record, key.known_keys):
                 return record
-            if not record.signed and digest_is_signed(path, key.gateway, key.known):
+            if not record.signed and digest_is_signed(path, key.gateway, key.known_keys):
                 return record
     return None
 
@@ -146,7 +146,7 @@ def check_row(connection: sqlite3.Connection, directory: Path, sequence: int, ke
     right, reason = None, "it is not signed"
     if record.signed:
         try:
-            right, reason = proven(record, key.known)
+            right, reason = proven(record, key.known_keys)
         except UnprovenError as error:
             reason = str(error)
     if not reason:
@@ -203,7 +203,7 @@ def _missing(connection: sqlite3.Connection, records: Iterable[StoredResult]) ->
     return missing
 
 
-def _published(metadata: dict[str, str]) -> int:
+def _last_published(metadata: dict[str, str]) -> int:
     """The last published result when a recording began; 0 where unknown: better published twice than never."""
     text = metadata.get("published", "")
     return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else 0

@@ -229,9 +229,9 @@ def damage(connection: sqlite3.Connection) -> str:
         return f"a result has a number above {LARGEST_MARK}"
     try:
         read_marks(connection)
-        _check_all(connection.execute(f"SELECT {RESULT_COLUMNS}, crc FROM results"))
-        _check_all(connection.execute("SELECT sequence, data, signed_crc FROM signed"))
-        _check_all(connection.execute("SELECT sensor, what, count, up_to, crc FROM removed"))
+        _check_rows(connection.execute(f"SELECT {RESULT_COLUMNS}, crc FROM results"))
+        _check_rows(connection.execute("SELECT sequence, data, signed_crc FROM signed"))
+        _check_rows(connection.execute("SELECT sensor, what, count, up_to, crc FROM removed"))
         read_memories(connection)
         read_states(connection)
         latest = [checked(row) for row in connection.execute("SELECT * FROM latest")]
@@ -260,6 +260,6 @@ def _is_ours(connection: sqlite3.Connection) -> bool:
     return sorted(sql for (sql,) in rows) == sorted(_STATEMENTS)
 
 
-def _check_all(rows: Iterable[tuple[object, ...]]) -> None:
+def _check_rows(rows: Iterable[tuple[object, ...]]) -> None:
     for row in rows:
         checked(row)

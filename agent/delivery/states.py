@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from agent.core.events import CalibrationUpdate
 from agent.core.memory import Memory
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 # s; after this time no further recording is replayed at a start. One replay takes seconds for an hour of recording.
 LONGEST_S = 60.0
-
+# Of the store at a start; behind: a crash may have kept states from it.
+Completeness = Literal["complete", "behind", "new"]
 
 # Gives the states of the estimation at the end of a recording, as far as the keys cover it; without keys, all of it.
 # None where it cannot be replayed or is not covered.
@@ -84,7 +85,7 @@ class States:
         others = [known for known in self.memories if (known.sensor, known.identity) != device]
         self.memories = sorted([*others, memory], key=lambda known: known.sequence)
 
-    def known(self, sensor: str, identity: str) -> int:
+    def sequence_of(self, sensor: str, identity: str) -> int:
         """The result that the state of a device follows; 0 where there is none."""
         return next((m.sequence for m in self.memories if (m.sensor, m.identity) == (sensor, identity)), 0)
 
@@ -98,61 +99,62 @@ def _take_from(states: States, found: Sequence[Memory] | None, number: int, name
         states.faults.append(f"{name} does not give the states of the estimation where it ends")
 
 
+@dataclass(frozen=True)
+class _Recordings:
+    """Recordings by name, each of which may be replayed once. `keys`: of their signatures, as in Recall."""
+
+    files: dict[str, Path]
+    recall: Recall
+    keys: KnownKeys | None
+
+    def states(self, name: str) -> Sequence[Memory] | None:
+        """The states where this recording ends; None where it does not give them."""
+        return self.recall(self.files.pop(name), self.keys)
+
+
 def states_at_start(
     connection: sqlite3.Connection,
     directory: Path,
     recall: Recall,
     key: GatewayKey | None,
     epoch: str,
-    *,
-    behind: bool,
-    lost: bool,
+    store_is: Completeness,
 ) -> States:
-    """The states with which the next run begins. `behind`: a crash may have kept some from the store. `lost`: the store
-    is new. `epoch`: of the store. Raises sqlite3.Error, DamagedRow, OSError.
-    """
-    states = States() if lost else _stored(connection, key, epoch)
-    lost = lost or bool(states.faults)
+    """The states with which the next run begins. `epoch`: of the store. Raises sqlite3.Error, DamagedRow, OSError."""
+    states = States() if store_is == "new" else _states_in_store(connection, key, epoch)
+    lost = store_is == "new" or bool(states.faults)
     files = {final_name(path): path for _, path in recordings(directory)}
-    keys, end_s = key.known if key is not None else None, time.monotonic() + LONGEST_S
+    keys, end_s = key.known_keys if key is not None else None, time.monotonic() + LONGEST_S
     if key is not None and _is_new(connection, directory, files.values()):
         states.faults.append(f"nothing in {directory} is signed: this start takes over once what is not signed")
         keys = None
-    if _take_newest(files, recall, key, keys, states, behind=behind, lost=lost):
-        _take_calibrated(connection, files, recall, keys, states, end_s)
+    replayable = _Recordings(files, recall, keys)
+    if _take_newest(replayable, key, states, behind=store_is == "behind", lost=lost):
+        _take_calibrated(connection, replayable, states, end_s)
         if key is not None:
             _begin_from_calibrations(connection, key, states)
     return states
 
 
-def _take_newest(
-    files: dict[str, Path],
-    recall: Recall,
-    key: GatewayKey | None,
-    keys: KnownKeys | None,
-    states: States,
-    *,
-    behind: bool,
-    lost: bool,
-) -> bool:
+def _take_newest(replayable: _Recordings, key: GatewayKey | None, states: States, *, behind: bool, lost: bool) -> bool:
     """Take the states where the newest recording ends, if they may be newer than those in the store. Returns whether
     states may be lost: they were before, or this recording does not give them."""
-    path = next((path for path in reversed(files.values()) if first_event(path) is not None), None)
+    path = next((path for path in reversed(replayable.files.values()) if first_event(path) is not None), None)
     if path is None:
         return lost
-    number, last = _reached(path, key)
+    number, last = _end_of(path, key)
     states.late = states.recording < number or states.sequence < last
     if states.late and not (lost or behind):
         states.faults.append("the states of the estimation in the store are older than the newest recording")
     if behind or lost or states.late:
-        found = recall(files.pop(final_name(path)), keys)
+        found = replayable.states(final_name(path))
         _take_from(states, found, number, path.name, signed=key is not None)
         lost = lost or found is None
     states.recording, states.sequence = max(states.recording, number), max(states.sequence, last)
     return lost
 
 
-def _stored(connection: sqlite3.Connection, key: GatewayKey | None, epoch: str) -> States:
+def _states_in_store(connection: sqlite3.Connection, key: GatewayKey | None, epoch: str) -> States:
     """The states in the store; with a key only if they are those that it signed."""
     memories = read_memories(connection)
     if key is None:
@@ -163,7 +165,7 @@ def _stored(connection: sqlite3.Connection, key: GatewayKey | None, epoch: str) 
             return States()
         if not data:
             raise SignedTextError("no signed list names them, as in a store of an earlier version")
-        listed = StateList.read(data, key.gateway, key.known)
+        listed = StateList.read(data, key.gateway, key.known_keys)
         if listed.epoch != epoch:
             raise SignedTextError(f"they are of the epoch {listed.epoch!r:.40}, the store is of {epoch}")
         if fault := listed.fault(memories):
@@ -173,7 +175,7 @@ def _stored(connection: sqlite3.Connection, key: GatewayKey | None, epoch: str) 
     return States(memories, listed.recording, listed.sequence)
 
 
-def _reached(path: Path, key: GatewayKey | None) -> tuple[int, int]:
+def _end_of(path: Path, key: GatewayKey | None) -> tuple[int, int]:
     """(number of a recording, number of the last result in it or before it); both 0 without a key."""
     if key is None:
         return 0, 0
@@ -182,11 +184,11 @@ def _reached(path: Path, key: GatewayKey | None) -> tuple[int, int]:
     signed, chain = signed_text(signature), signed_results(signature)
     if chain is not None and f"\nrecording {number}\n" in signed.text:
         after = ResultsChain.of_text(chain).before
-        return number, after if not signed.fault_by(key.known, key.gateway) else _last_found(path)
-    return number, _last_found(path)
+        return number, after if not signed.fault_by(key.known_keys, key.gateway) else _last_sequence(path)
+    return number, _last_sequence(path)
 
 
-def _last_found(path: Path) -> int:
+def _last_sequence(path: Path) -> int:
     return max((result.sequence for result in scan(path).results), default=0)
 
 
@@ -205,22 +207,15 @@ SELECT sensor, identity, recording, max(sequence) AS newest FROM results
 WHERE what = 'calibration' AND recorded = 1 GROUP BY sensor, identity, recording ORDER BY newest DESC"""
 
 
-def _take_calibrated(
-    connection: sqlite3.Connection,
-    files: dict[str, Path],
-    recall: Recall,
-    keys: KnownKeys | None,
-    states: States,
-    end_s: float,
-) -> None:
+def _take_calibrated(connection: sqlite3.Connection, replayable: _Recordings, states: States, end_s: float) -> None:
     """Replay, newest first, the recordings with a calibration that is newer than the state known of its device."""
     for sensor, identity, name, sequence in connection.execute(_CALIBRATED).fetchall():
-        if states.known(sensor, identity) >= sequence or name not in files:
+        if states.sequence_of(sensor, identity) >= sequence or name not in replayable.files:
             continue
         if time.monotonic() >= end_s:
             return
-        for memory in recall(files.pop(name), keys) or ():
-            if memory.sequence > states.known(memory.sensor, memory.identity):
+        for memory in replayable.states(name) or ():
+            if memory.sequence > states.sequence_of(memory.sensor, memory.identity):
                 states.add(memory)
                 states.replayed += 1
 
@@ -233,10 +228,10 @@ def _begin_from_calibrations(connection: sqlite3.Connection, key: GatewayKey, st
     for row in connection.execute(f"{JOINED} WHERE what = 'calibration' ORDER BY sequence DESC"):
         record = StoredResult.of_joined(row)
         device = (record.sensor, record.identity)
-        if device in done or states.known(*device) >= record.sequence or not record.signed:
+        if device in done or states.sequence_of(*device) >= record.sequence or not record.signed:
             continue
         with suppress(UnprovenError):
-            update = proven(record, key.known)[0].result
+            update = proven(record, key.known_keys)[0].result
             if isinstance(update, CalibrationUpdate) and update.identity == record.identity:
                 states.add(Memory(*device, record.sequence, of_calibration(update)))
                 states.faults.append(f"{device[0]} begins again from calibration {record.sequence}, which is signed")

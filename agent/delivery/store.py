@@ -34,7 +34,7 @@ from agent.delivery.schema import (
     write_states,
 )
 from agent.delivery.signed_states import Digests, StateList, digest_of
-from agent.delivery.states import Recall, no_memories, states_at_start
+from agent.delivery.states import Completeness, Recall, no_memories, states_at_start
 from agent.recording.continuation import UNKEPT_MAX
 
 # Results that a failing disk refused wait in memory for the next commit; beyond this number the oldest are dropped.
@@ -120,7 +120,7 @@ class Store:
 
     def history(self) -> History:
         """Open a reader that gives only what the gateway's key signed. Use it in one thread. Raises StoreError."""
-        return History(self.path, self._key.known if self._key is not None else None)
+        return History(self.path, self._key.known_keys if self._key is not None else None)
 
     def find(self, sensor: str, what: str, sequence: int) -> StoredResult | None:
         """A result that is to come into force, as the gateway's key signed it; None where there is none.
@@ -238,7 +238,7 @@ class Store:
         write_mark(self._connection, "file", self._file_sequence)
 
     def _recover(self, *, everything: bool) -> Recovered:
-        keys = self._key.known if self._key is not None else None
+        keys = self._key.known_keys if self._key is not None else None
         return recover(self._connection, self.path.parent, keys, everything=everything)
 
     def _write_memories(self, memories: Iterable[Memory]) -> None:
@@ -268,8 +268,9 @@ class Store:
             self.epoch = f"{epoch:016x}"
             directory = self.path.parent
             recovered = Recovered() if marks["clean"] else self._recover(everything=new)
-            behind = not marks["clean"] or bool(recovered.results)
-            found = states_at_start(self._connection, directory, recall, self._key, self.epoch, behind=behind, lost=new)
+            complete = bool(marks["clean"]) and not recovered.results
+            store_is: Completeness = "new" if new else "complete" if complete else "behind"
+            found = states_at_start(self._connection, directory, recall, self._key, self.epoch, store_is)
             if found.late and marks["clean"]:
                 recovered = self._recover(everything=False)
             recovered.memories = found.replayed

@@ -83,7 +83,7 @@ def find_engine(engine: str, directories: Sequence[Path], trusted: Collection[st
     return f"{file_name(engine)} is in none of: {', '.join(map(str, directories))}" if directories else "no directory"
 
 
-def told_of(path: Path) -> dict[str, str]:
+def description(path: Path) -> dict[str, str]:
     """What can be said of a file without trust in it: its path and SHA-256, and which release it is; or a fault."""
     try:
         sha256 = hashlib.sha256(read_file(path, LARGEST)).hexdigest()

@@ -189,7 +189,7 @@ class EngineProcess:
                     data = os.read(key.fd, 1 << 20)
                     if key.fileobj is target:
                         if not data:
-                            raise self._ended()
+                            raise self._end_reason()
                         if (answer := self._answer(data)) is not None:
                             return answer
                     elif data:
@@ -204,7 +204,7 @@ class EngineProcess:
         try:
             return os.write(descriptor, data)
         except BrokenPipeError:
-            raise self._ended() from None
+            raise self._end_reason() from None
 
     def _answer(self, data: bytes) -> list[bytes] | None:
         try:
@@ -212,7 +212,7 @@ class EngineProcess:
         except frames.FrameError as error:
             raise self._broken(f"it breaks the format: {error}") from None
 
-    def _ended(self) -> EngineError:
+    def _end_reason(self) -> EngineError:
         """Why the process has ended on its own."""
         try:
             status = self._process.wait(_END_S)

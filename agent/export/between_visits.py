@@ -42,7 +42,7 @@ def at_temperature(calibration: CalibrationUpdate, degc: float | None) -> tuple[
     return S, Q
 
 
-def solved(S: Array, Q: Array, values: Array) -> Array | None:
+def acceleration_of(S: Array, Q: Array, values: Array) -> Array | None:
     """a = S^-1 (V - Q) in m/s2; None where S has no inverse."""
     try:
         return np.asarray(np.linalg.solve(S, (values - Q).T).T)
@@ -65,14 +65,14 @@ class BetweenVisits:
         if k < 0:
             return None, f"they are before the first calibration ({date_of(self.calibrations[0].date_utc_ns)})"
         ends = self.calibrations[k : k + 2]
-        if strange := next((one for one in ends if _named(one.identity) != _named(device)), None):
+        if strange := next((one for one in ends if _device_name(one.identity) != _device_name(device)), None):
             return None, f"the calibration of {date_of(strange.date_utc_ns)} is of {strange.identity}, they of {device}"
         S, Q = at_temperature(ends[0], degc)
         if len(ends) == 2:
             later_S, later_Q = at_temperature(ends[1], degc)
             weight = self._weight(ends[0], ends[1], t_utc_ns)
             S, Q = S + weight[:9].reshape(3, 3) * (later_S - S), Q + weight[9:] * (later_Q - Q)
-        a = solved(S, Q, values)
+        a = acceleration_of(S, Q, values)
         return a, "" if a is not None else "S has no inverse"
 
     def standard_uncertainty(self, t_utc_ns: int) -> Array:
@@ -98,7 +98,7 @@ class BetweenVisits:
         return np.asarray(np.sqrt(variance + np.where(stepped, w * (1.0 - w) * moved**2, 0.0)))
 
     @property
-    def told(self) -> dict[str, str]:
+    def head(self) -> dict[str, str]:
         """What a file says of it."""
         found = {"correction": EQUATION, "calibration": NUMBER}
         for one in self.calibrations:
@@ -108,11 +108,11 @@ class BetweenVisits:
             times = np.linspace(first.date_utc_ns, later.date_utc_ns - 1, GRID).astype(np.int64).tolist()
             most = np.max([self.standard_uncertainty(t) for t in times], axis=0)
             found[f"between {date_of(first.date_utc_ns)} and {date_of(later.date_utc_ns)}"] = (
-                f"{self._how(first, later)}, U {_percent(later, most)} at most"
+                f"{self._course(first, later)}, U {_percent(later, most)} at most"
             )
         return found
 
-    def _how(self, first: CalibrationUpdate, later: CalibrationUpdate) -> str:
+    def _course(self, first: CalibrationUpdate, later: CalibrationUpdate) -> str:
         if self.step is None or not self._stepped(first, later).any():
             return "on a line"
         what = f"turn about {self.step.axes}" if self.step.turn else f"sensitivity of {self.step.axes}"
@@ -150,7 +150,7 @@ def between_visits(channel: Channel, updates: Iterable[CalibrationUpdate], step:
     return BetweenVisits(channel, [by_date[date] for date in sorted(by_date)], step)
 
 
-def _named(identity: str) -> str:
+def _device_name(identity: str) -> str:
     """Kind and serial number of an identity, without the digest of its settings."""
     return identity.rpartition(" ")[0]
 

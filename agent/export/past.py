@@ -15,7 +15,7 @@ from agent.core.kept import update_of
 from agent.core.memory import Memory
 from agent.core.past import KnownPast, PastError, dates_of, past_of
 from agent.core.snapshot import unpack
-from agent.delivery.calibrations import made
+from agent.delivery.calibrations import first_in_force
 from agent.delivery.history import History
 from agent.export.at_the_end import memories_at_the_end
 from agent.export.samples import followed, new_file, steps_of
@@ -52,7 +52,7 @@ def pasts(history: History) -> list[SensorPast]:
 
     def in_force_at(sensor: str, times_utc_ns: Sequence[int]) -> list[InForce]:
         records = history.in_force_at(sensor, times_utc_ns)
-        return [None if record is None else (made(record), record.identity) for record in records]
+        return [None if record is None else (first_in_force(record), record.identity) for record in records]
 
     return [_past(memory, in_force_at) for memory in history.memories()]
 

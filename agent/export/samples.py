@@ -20,7 +20,7 @@ from agent.core.identity import device_of, identity_of
 from agent.core.kept import update_of
 from agent.core.snapshot import unpack
 from agent.core.stream import UNCOUNTED, DeviceStream
-from agent.export.between_visits import BetweenVisits, at_temperature, solved
+from agent.export.between_visits import BetweenVisits, acceleration_of, at_temperature
 from agent.export.smoothing import Smoothed
 from agent.recording.reading import RecordedStep, RecordingReader, first_event
 from agent.site_watch.suspicion import Suspicion
@@ -143,7 +143,7 @@ def _of_file(path: Path, content: RecordedContent) -> Iterator[ExportedSamples]:
 
 def acceleration(values: Array, calibration: CalibrationUpdate, degc: float | None) -> Array | None:
     """a = S^-1 (V - Q) in m/s2 at this temperature, which is only known where the device tells it; None: no inverse."""
-    return solved(*at_temperature(calibration, degc), values)
+    return acceleration_of(*at_temperature(calibration, degc), values)
 
 
 @dataclass(frozen=True, slots=True)

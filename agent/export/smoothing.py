@@ -49,7 +49,7 @@ class Smoothed:
             return None, "S has no inverse"
 
     @property
-    def told(self) -> dict[str, str]:
+    def head(self) -> dict[str, str]:
         """What a file says of it."""
         found = {"correction": EQUATION, "calibration": NUMBER}
         return found | {f"smoothing of {known.identity}": smoothing(known) for known in self.by_device.values()}

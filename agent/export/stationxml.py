@@ -25,7 +25,7 @@ from agent.export.smoothing import smoothing
 from agent.terminal.text import one_line
 from calib.estimate.correction import Law
 from calib.model import PARAMETERS
-from calib.output_unit import written
+from calib.output_unit import unit_text
 from calib.rounding import plus_minus
 from calib.state.past import REACH_DAYS
 
@@ -141,13 +141,13 @@ def _channel(station: ET.Element, axis: int, epoch: _Epoch, unit: str, rate_hz: 
     S, u = float(law.mean[main]), float(np.sqrt(law.covariance[main, main]))
     response = _add(channel, "Response")
     if law.determined[main] and S:
-        output = UNITS.get(unit, unit or written(unit))
+        output = UNITS.get(unit, unit or unit_text(unit))
         _sensitivity(response, S, k * u / abs(S), known.reference_frequency_hz, rate_hz, output)
 
 
 def _parameters(axis: int, law: Law, unit: str, k: float) -> str:
     """S and Q of an axis with U, also what no element can hold."""
-    name, own = written(unit), [*range(AXES * axis, AXES * axis + AXES), 9 + axis]
+    name, own = unit_text(unit), [*range(AXES * axis, AXES * axis + AXES), 9 + axis]
     u = np.sqrt(law.covariance.diagonal())
     units = [f"{name}/(m/s2)"] * AXES + [name]
     told = [

@@ -46,7 +46,7 @@ def _about(content: RecordedContent) -> dict[str, str]:
     """What a table says of itself: of corrected samples, and of a sensor that its site suspects."""
     if content.smoothed is None:
         return _suspected(content)
-    told = {name: one_line(text) for name, text in content.smoothed.told.items()}
+    told = {name: one_line(text) for name, text in content.smoothed.head.items()}
     runs = dict.fromkeys(update.made[0] for update in content.calibrations)
     runs_told = one_line(", ".join(runs))
     return {"device": one_line(content.device), **told, "runs of the calibrations": runs_told, **_suspected(content)}

@@ -46,7 +46,7 @@ class Meeting:
     u_gravity_mps2: float
 
 
-def stated(section: DeviceSection, directory: Path) -> tuple[Array, Array] | None:
+def stated_calibration(section: DeviceSection, directory: Path) -> tuple[Array, Array] | None:
     """Mean (12,) and covariance (12, 12) of S and Q by a certificate or a nominal sensitivity; None without one.
 
     Raises TableError.
@@ -115,7 +115,7 @@ def meeting(sensor: str, reference: str, stretches: Sequence[Tables], priors: Pr
     return Meeting(sensor, reference, found, tuple(reasons), *told)
 
 
-def met(sensor: str, reference: str, params: dict[str, Any], known: tuple[Array, Array] | None) -> Meeting:
+def meeting_of(sensor: str, reference: str, params: dict[str, Any], known: tuple[Array, Array] | None) -> Meeting:
     """A meeting by its files and options. Raises TableError."""
     options = options_of(params)
     found = meeting(sensor, reference, [read(params, options, known)], priors_of(options))
@@ -130,12 +130,12 @@ def met(sensor: str, reference: str, params: dict[str, Any], known: tuple[Array,
 
 def device(name: str, section: DeviceSection, directory: Path, meetings: list[Meeting]) -> SiteDevice:
     """What is known of a device before any link. Raises TableError."""
-    known = stated(section, directory)
+    known = stated_calibration(section, directory)
     if known is not None:
-        return SiteDevice.known(name, *known)
+        return SiteDevice.with_covariance(name, *known)
     if section.u_sensitivity_pct is not None:
         channels = max((m.channels for m in meetings if m.reference == name), default=3)
         return SiteDevice.reference(name, section.u_sensitivity_pct / 100.0, channels)
     first = next((m.found for m in meetings if m.found is not None and m.sensor == name), None)
     mean = np.append(np.eye(3).ravel(), np.zeros(3)) if first is None else first.mean
-    return SiteDevice.known(name, mean, np.diag(np.full(12, np.inf)))
+    return SiteDevice.with_covariance(name, mean, np.diag(np.full(12, np.inf)))

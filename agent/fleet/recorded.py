@@ -90,7 +90,7 @@ def meetings_in(paths: Sequence[Path]) -> tuple[list[SiteDevice], list[Meeting]]
         mean, covariance = first.priors.parameters, first.priors.covariance
         assert mean is not None
         assert covariance is not None
-        devices.setdefault(sensor, SiteDevice.known(sensor, mean, covariance))
+        devices.setdefault(sensor, SiteDevice.with_covariance(sensor, mean, covariance))
         devices.setdefault(reference, SiteDevice.reference(reference, first.priors.reference, first.channels))
     return list(devices.values()), meetings
 

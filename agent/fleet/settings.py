@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from agent.config import Config, recorded_config
 from agent.config.channel import Channel
-from agent.config.faults import shown, told
+from agent.config.faults import model_faults, path_text
 
 LONGEST = 10_000  # characters of one setting
 DEEPEST = 8  # parts of a key; the configuration has four levels
@@ -65,10 +65,10 @@ class ChangedSetting:
         try:
             Channel.model_validate({"sensor": "sensor"} | nest)
         except ValidationError as error:
-            for path, what in told(error, {"sensor": "sensor"} | nest, Channel):
+            for path, what in model_faults(error, {"sensor": "sensor"} | nest, Channel):
                 own = path[: len(self.path)] == self.path or (what.startswith("there is no") and path)
                 if own and not (self.scaled and path == self.path and "no such setting" not in what):
-                    raise SettingError(f"{shown(('channels', self.channel, *path))}: {what}") from None
+                    raise SettingError(f"{path_text(('channels', self.channel, *path))}: {what}") from None
 
 
 def changed_config(config_json: str, settings: Sequence[ChangedSetting]) -> Config:
@@ -84,7 +84,7 @@ def changed_config(config_json: str, settings: Sequence[ChangedSetting]) -> Conf
     try:
         return Config.model_validate(raw)
     except ValidationError as error:
-        lines = [f"{shown(path)}: {what}" for path, what in told(error, raw, Config)]
+        lines = [f"{path_text(path)}: {what}" for path, what in model_faults(error, raw, Config)]
         raise SettingError("; ".join(lines[:5])) from None
 
 

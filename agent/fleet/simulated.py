@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import repeat
 from pathlib import Path
@@ -98,26 +99,38 @@ class Stories:
         return SimulatedSensor(story, serial_number)
 
 
+@dataclass(frozen=True)
+class FleetPlan:
+    """So many gateways with so many `sensors` each, the routers, and the directory of the stores."""
+
+    gateways: int
+    sensors: int
+    seed: int
+    connect: Sequence[str]
+    data_dir: Path
+
+
 class SimulatedGateway:
     """One gateway with a store, a signing key and a Zenoh client of its own."""
 
     def __init__(
-        self, name: str, behaviour: Behaviour, sensors: Sequence[SimulatedSensor], seed: list[int],
-        connect: Sequence[str], data_dir: Path, twin: Sequence[SimulatedSensor] = (),
+        self, plan: FleetPlan, number: int, behaviour: Behaviour, sensors: Sequence[SimulatedSensor],
+        twin: Sequence[SimulatedSensor] = (),
     ) -> None:  # fmt: skip
-        """`seed`: of the signing key. `twin`: the sensors of another gateway that has the same name, key and store
-        from BEGINS["cloned"] on, as after a copy of the whole SD card. Raises EndpointError, StoreError."""
+        """`twin`: the sensors of another gateway that has the same name, key and store from BEGINS["cloned"] on, as
+        after a copy of the whole SD card. Raises EndpointError, StoreError."""
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-        self.name, self.behaviour = name, behaviour
-        self._connect, self._seed, self._data_dir = connect, seed, data_dir
-        secret = hashlib.sha256(f"simulated {seed}".encode()).digest()  # protects nothing: anyone can make it
+        self.name = name = f"gw{number:04}"
+        self.behaviour, self._plan, self._number, data_dir = behaviour, plan, number, plan.data_dir
+        # Protects nothing: anyone can make it.
+        secret = hashlib.sha256(f"simulated {[plan.seed, 1, number]}".encode()).digest()
         self._signer = Signer(Ed25519PrivateKey.from_private_bytes(secret))
         (data_dir / name).mkdir(parents=True, exist_ok=True)
         self._store = Store(data_dir / name)
         self._signing = ResultSigner(self._store.epoch, self._signer)
         self._signing.gateway = self.source
-        self._publisher = Publisher(SITE, name, connect, self._store, mode="client", poll_s=POLL_S)
+        self._publisher = Publisher(SITE, name, plan.connect, self._store, mode="client", poll_s=POLL_S)
         self._sensors, self._of_twin = sensors, twin
         self._twin: SimulatedGateway | None = None
         self._health = dict.fromkeys((sensor.name for sensor in sensors), NOTHING)
@@ -209,14 +222,14 @@ class SimulatedGateway:
 
     def _cloned(self, stop: StopEvent) -> SimulatedGateway:
         """Another gateway with a copy of all that this one has, but for its sensors."""
-        directory = self._data_dir / f"{self.name}-twin"
+        directory = self._plan.data_dir / f"{self.name}-twin"
         (directory / self.name).mkdir(parents=True)
         with (
-            closing(connect_read_only(self._data_dir / self.name / FILE_NAME)) as read,
+            closing(connect_read_only(self._plan.data_dir / self.name / FILE_NAME)) as read,
             closing(sqlite3.connect(directory / self.name / FILE_NAME)) as write,
         ):
             read.backup(write)
-        twin = SimulatedGateway(self.name, "sound", self._of_twin, self._seed, self._connect, directory)
+        twin = SimulatedGateway(replace(self._plan, data_dir=directory), self._number, "sound", self._of_twin)
         twin.open(stop)
         return twin
 
@@ -252,7 +265,7 @@ class SimulatedGateway:
         While no router answers, it sends nothing.
         """
         try:
-            session = zenoh.open(session_config("client", connect=self._connect))
+            session = zenoh.open(session_config("client", connect=self._plan.connect))
         except zenoh.ZError:
             return
         with closed_in_time(session):
@@ -271,29 +284,24 @@ class SimulatedGateway:
 
 
 class SimulatedFleet(AbstractContextManager["SimulatedFleet"]):
-    """`count` gateways with `sensors` sensors each. `unconnected`: those that found no router.
+    """Gateways as planned. `unconnected`: the number of those that found no router.
 
     `numbers`: which of the gateways are here; default: all. `stop`: once it is set, what is going on ends soon.
     Raises EndpointError, StoreError.
     """
 
-    def __init__(
-        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path,
-        numbers: Sequence[int] | None = None, stop: StopEvent = NEVER,
-    ) -> None:  # fmt: skip
+    def __init__(self, plan: FleetPlan, numbers: Sequence[int] | None = None, stop: StopEvent = NEVER) -> None:
         self._stop = stop
-        numbers = range(count) if numbers is None else numbers
-        kinds, stories = behaviours(count, seed), Stories(seed)
+        numbers = range(plan.gateways) if numbers is None else numbers
+        kinds, stories = behaviours(plan.gateways, plan.seed), Stories(plan.seed)
         with ExitStack() as opened:
             self._pool = opened.enter_context(ThreadPoolExecutor(min(AT_ONCE, len(numbers)), "simulated"))
             self.gateways: list[SimulatedGateway] = []
             opened.callback(lambda: list(self._pool.map(SimulatedGateway.close, self.gateways)))
             for k in numbers if not stop.is_set() else ():
-                own = stories.sensors(k, kinds[k], sensors)
-                twin = stories.of_twin(k, sensors) if kinds[k] == "cloned" else ()
-                self.gateways.append(
-                    SimulatedGateway(f"gw{k:04}", kinds[k], own, [seed, 1, k], connect, data_dir, twin)
-                )
+                sensors = stories.sensors(k, kinds[k], plan.sensors)
+                twin = stories.of_twin(k, plan.sensors) if kinds[k] == "cloned" else ()
+                self.gateways.append(SimulatedGateway(plan, k, kinds[k], sensors, twin))
             connected = list(self._pool.map(SimulatedGateway.open, self.gateways, repeat(stop)))
             self.unconnected = connected.count(False)
             self._opened = opened.pop_all()

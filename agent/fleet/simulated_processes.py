@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from agent.delivery.ending import ProcessEnd, StopRequest
 from agent.delivery.session import session_config
-from agent.fleet.simulated import SimulatedFleet
+from agent.fleet.simulated import FleetPlan, SimulatedFleet
 from agent.fleet.simulated_sensor import Behaviour
 from agent.fleet.workers import begin
 
@@ -41,19 +40,16 @@ class NamedGateway(NamedTuple):
 
 
 class FleetProcesses(AbstractContextManager["FleetProcesses"]):
-    """`count` gateways with `sensors` sensors each, in processes of at most GATEWAYS_EACH, which open one by one.
+    """Gateways as planned, in processes of at most GATEWAYS_EACH, which open one by one.
 
     `unconnected`: the number of gateways that found no router. The processes end with this process, and LEAVE_S after
     they are to stop. Raises EndpointError, StoreError; the methods raise BrokenProcessPool where a process has ended.
     """
 
-    def __init__(
-        self, count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path,
-        stop: StopRequest | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, plan: FleetPlan, stop: StopRequest | None = None) -> None:
         """`stop`: once it is set, what is going on ends soon."""
-        session_config("client", connect=connect)  # raises EndpointError here rather than in another process
-        parts = -(-count // GATEWAYS_EACH)
+        session_config("client", connect=plan.connect)  # raises EndpointError here rather than in another process
+        parts = -(-plan.gateways // GATEWAYS_EACH)
         self.gateways: list[NamedGateway] = []
         self.unconnected = 0
         self._parts: list[ProcessPoolExecutor] = []
@@ -66,9 +62,9 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
                 process = opened.enter_context(
                     ProcessPoolExecutor(1, mp_context=SPAWN, initializer=_begin, initargs=(self._stop,))
                 )
-                numbers = range(part, count, parts)
+                numbers = range(part, plan.gateways, parts)
                 with _without_interrupts():
-                    opening = process.submit(_open, count, sensors, seed, connect, data_dir, numbers)
+                    opening = process.submit(_open, plan, numbers)
                 gateways, unconnected = opening.result()
                 opened.callback(_leave, process)
                 self._parts.append(process)
@@ -78,19 +74,21 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
 
     def step(self, t_utc_ns: int, within_s: float = 0.0) -> int:
         """As SimulatedFleet.step, in each process."""
-        return sum(self._each(_step, t_utc_ns, within_s))
+        return sum(self._in_each_process(_step, t_utc_ns, within_s))
 
     def last_sequence(self) -> dict[str, int]:
         """The number of the last result of each gateway, by its name."""
-        return {name: last for part in self._each(_last_sequence) for name, last in part.items()}
+        return {name: last for part in self._in_each_process(_last_sequence) for name, last in part.items()}
 
     def truth(self) -> list[dict[str, Any]]:
         """What is true of each gateway and its sensors now, by the names of the gateways."""
-        return sorted((gateway for part in self._each(_truth) for gateway in part), key=lambda told: told["gateway"])
+        return sorted(
+            (gateway for part in self._in_each_process(_truth) for gateway in part), key=lambda told: told["gateway"]
+        )
 
     def pids(self) -> list[int]:
         """Of its processes."""
-        return self._each(os.getpid)
+        return self._in_each_process(os.getpid)
 
     def names_of(self, behaviour: Behaviour) -> list[str]:
         """The gateways that behave so."""
@@ -109,7 +107,7 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
             for process in multiprocessing.active_children():
                 process.kill()
 
-    def _each(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
+    def _in_each_process(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
         """What the function gives in each process, where they run at the same time."""
         return [future.result() for future in [part.submit(what, *arguments) for part in self._parts]]
 
@@ -135,11 +133,9 @@ def _begin(stop: StopRequest) -> None:
     os.nice(NICE)
 
 
-def _open(
-    count: int, sensors: int, seed: int, connect: Sequence[str], data_dir: Path, numbers: Sequence[int]
-) -> tuple[list[NamedGateway], int]:
+def _open(plan: FleetPlan, numbers: Sequence[int]) -> tuple[list[NamedGateway], int]:
     global _part
-    _part = SimulatedFleet(count, sensors, seed, connect, data_dir, numbers, _stop)
+    _part = SimulatedFleet(plan, numbers, _stop)
     return [NamedGateway(g.name, g.source, g.behaviour, g.public_key) for g in _part.gateways], _part.unconnected
 
 

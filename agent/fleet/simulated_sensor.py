@@ -79,7 +79,7 @@ class Story:
                 raise ValueError(f"round {number} was asked for, but round {self._rounds} is the next one")
             return self._newest
 
-    def told(self) -> dict[str, Any]:
+    def newest_truth(self) -> dict[str, Any]:
         """What is true in the newest round; `sensitivity` and `offset` in counts, `change_pct` of `parameter`."""
         number = max(self._rounds - 1, 0)
         truth, begun = self.truth(number), self.behaviour != "sound" and number >= BEGINS[self.behaviour]
@@ -153,13 +153,13 @@ class SimulatedSensor:
     def results(self, number: int, t_utc_ns: int, first_sequence: int) -> list[Result]:
         """The results of round `number` (from 0), numbered from `first_sequence`."""
         made = self.story.results(number, t_utc_ns)
-        return [self._own(result, t_utc_ns, first_sequence + k) for k, result in enumerate(made)]
+        return [self._relabel(result, t_utc_ns, first_sequence + k) for k, result in enumerate(made)]
 
     def truth(self) -> dict[str, Any]:
         """What is true of the sensor in the newest round, for comparison with what is said of it."""
-        return {"sensor": self.name, "identity": self._identity, **self.story.told()}
+        return {"sensor": self.name, "identity": self._identity, **self.story.newest_truth()}
 
-    def _own(self, result: Result, t_utc_ns: int, sequence: int) -> Result:
+    def _relabel(self, result: Result, t_utc_ns: int, sequence: int) -> Result:
         own: dict[str, Any] = {"t_utc_ns": t_utc_ns, "sequence": sequence}
         if isinstance(result, CalibrationUpdate):
             own["identity"] = self._identity

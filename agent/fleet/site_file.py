@@ -32,7 +32,7 @@ class DeviceSection(Section):
     u_nominal_pct: Annotated[float, Field(gt=0, le=100)] | None = None
 
     @model_validator(mode="after")
-    def _one_statement(self) -> DeviceSection:
+    def _check_statement(self) -> DeviceSection:
         if (self.nominal is None) != (self.u_nominal_pct is None):
             raise ValueError("nominal and u_nominal_pct must be given together")
         if sum(v is not None for v in (self.u_sensitivity_pct, self.certificate, self.nominal)) > 1:

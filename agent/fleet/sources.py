@@ -30,7 +30,7 @@ def is_address(place: str) -> bool:
     return "://" in place
 
 
-def found(given: Iterable[str]) -> list[str]:
+def recordings_in(given: Iterable[str]) -> list[str]:
     """The recordings that files, directories, patterns and addresses name; each once, in the order of what was given.
 
     A directory stands for all files in it, and below it, that end in `.mcap`. Raises SourceError.

@@ -127,9 +127,9 @@ class Fleet:
         }.get(what, what)
         if what not in RESULTS or (what == "drift" and fields["parameter"] not in PARAMETERS):
             return
+        place = site, gateway, sensor
         with self._mutex:
             self._knows((site, gateway))
-            place = site, gateway, sensor
             if what == "drift":
                 fields = fields | self._judged(place, fields)
             self._newest.setdefault(place, {})[part] = fields
@@ -139,10 +139,8 @@ class Fleet:
             self._silent.discard(place)
             self.version += 1
             self._touch(place)
-        if told := _told_of(what, fields):
-            self.note(
-                site, gateway, sensor, what, fields["t_utc_ns"], told, alarm=fresh and _needs_a_person(what, fields)
-            )
+        if told := _event_text(what, fields):
+            self.note(place, what, fields["t_utc_ns"], told, alarm=fresh and _needs_a_person(what, fields))
 
     def recall(self, place: Place, verdicts: Sequence[dict[str, Any]]) -> None:
         """Take earlier drift verdicts of a sensor, oldest first, after a restart.
@@ -163,14 +161,12 @@ class Fleet:
         self._since_stable[key] = first_utc_ns, drifts or fields["verdict"] == "drifting"
         return dict(zip(SINCE_STABLE, self._since_stable[key], strict=True))
 
-    def note(
-        self, site: str, gateway: str, sensor: str, what: str, t_utc_ns: int, told: str, *, alarm: bool = False
-    ) -> None:
+    def note(self, place: Place, what: str, t_utc_ns: int, text: str, *, alarm: bool = False) -> None:
         """Add an event to the list of the newest ones; an `alarm` also to those that people are told."""
-        event: dict[str, Any] = {"t_utc_ns": t_utc_ns, "site": site, "gateway": gateway, "sensor": sensor}
-        event |= {"what": what, "text": clipped(told)}
+        event: dict[str, Any] = {"t_utc_ns": t_utc_ns, **dict(zip(("site", "gateway", "sensor"), place, strict=True))}
+        event |= {"what": what, "text": clipped(text)}
         with self._mutex:
-            same = (site, gateway, sensor), what, _NUMBERS.sub("", told)
+            same = place, what, _NUMBERS.sub("", text)
             before = self._events.pop(same, {"first_utc_ns": t_utc_ns, "count": 0})
             self._events[same] = event | {"first_utc_ns": before["first_utc_ns"], "count": before["count"] + 1}
             if len(self._events) > EVENTS_MAX:
@@ -256,7 +252,7 @@ class Fleet:
                     if place in self._newest:
                         self._touch(place)
         for place in sorted(now.keys() - before):
-            self.note(*place, "watch", t_utc_ns, f"suspected: {now[place].text}", alarm=fresh)
+            self.note(place, "watch", t_utc_ns, f"suspected: {now[place].text}", alarm=fresh)
 
     def set_alive(self, site: str, gateway: str, alive: bool) -> None:
         """Whether the gateway is on the bus."""
@@ -281,7 +277,7 @@ class Fleet:
             for gateway in changed:
                 self._touch_gateway(gateway)
 
-    def set_told(self, site: str, gateway: str, status: bytes) -> None:
+    def set_gateway_status(self, site: str, gateway: str, status: bytes) -> None:
         """What a gateway says of itself, as JSON; what is no such status is ignored."""
         if len(status) > LARGEST_TOLD:
             return
@@ -311,13 +307,37 @@ class Fleet:
         with self._mutex:
             counts = Counter(place[:2] for place in self._newest)
             rows = [
-                _gateway_row(place, counts[place], place in self._alive, self._told.get(place),
-                             refused.get("/".join(place), 0), self._doubled.get(place, ()),
-                             self._in_turns.get(place, ()), retired="/".join(place) in self._retired)
-                | {"mixed_utc_ns": self._mixed_utc_ns.get(place)}
+                self._gateway_row(place, counts[place], refused.get("/".join(place), 0))
                 for place in self._gateways | {_place(source) for source in refused}
-            ]  # fmt: skip
+            ]
         return sorted(rows, key=lambda r: (not r["why"], r["site"], r["gateway"]))
+
+    def _gateway_row(self, gateway: tuple[str, str], sensors: int, refused: int) -> dict[str, Any]:
+        alive, retired = gateway in self._alive, "/".join(gateway) in self._retired
+        told, doubled = self._told.get(gateway), self._doubled.get(gateway, ())
+        why = [] if alive or retired else ["the gateway is not on the bus"]
+        if doubled:
+            why.append(f"{len(doubled)} gateways are on the bus under this name ({_runs(doubled)})")
+        elif in_turns := self._in_turns.get(gateway):
+            why.append(f"{_runs(in_turns)} {IN_TURNS}")
+        if told is not None and told.state not in CALM:
+            why.append(clipped(f"{told.state}: {'; '.join(told.reasons[:10])}"))
+        if refused:
+            why.append(f"{refused} results in its name were refused: no known key of this gateway signed them")
+        return {
+            "site": gateway[0],
+            "gateway": gateway[1],
+            "alive": alive,
+            "retired": retired,
+            "sensors": sensors,
+            "state": clipped(told.state) if told else "",
+            "version": clipped(told.version) if told else "",
+            "told_utc_ns": told.t_utc_ns if told else None,
+            "refused": refused,
+            "instances": max(len(doubled), 1),
+            "why": "; ".join(why),
+            "mixed_utc_ns": self._mixed_utc_ns.get(gateway),
+        }
 
     def _row_of(self, place: Place) -> dict[str, Any]:
         if place not in self._made:
@@ -363,7 +383,7 @@ def _needs_a_person(what: str, fields: dict[str, Any]) -> bool:
     return what == "status" and fields["status"] in NEEDS_A_PERSON
 
 
-def _told_of(what: str, fields: dict[str, Any]) -> str:
+def _event_text(what: str, fields: dict[str, Any]) -> str:
     """What the list of events says of a result; "" where it is no event."""
     if what == "status":
         return f"{fields['status']}: {fields['reason']}"
@@ -453,7 +473,7 @@ class _Presence:
     retired: bool
 
 
-def _why(
+def _reasons(
     status: Mapping[str, Any], verdicts: Sequence[Mapping[str, Any]], presence: _Presence, suspicion: Suspicion | None
 ) -> list[str]:
     """Why the sensor is not sound, or is not heard."""
@@ -510,7 +530,7 @@ def _row(
         "last_good_utc_ns": newest.get("good window", {}).get("t_utc_ns"),
         "result_utc_ns": max(fields["t_utc_ns"] for fields in newest.values()),
         "verified": bool(newest) and all(fields.get("signed_by") for fields in newest.values()),
-        "why": "; ".join(clipped(reason) for reason in _why(status, verdicts, presence, suspicion)),
+        "why": "; ".join(clipped(reason) for reason in _reasons(status, verdicts, presence, suspicion)),
     }
 
 
@@ -547,41 +567,6 @@ def _main_u(calibration: Mapping[str, Any]) -> dict[int, float]:
     values, u = calibration["sensitivity"], calibration["standard_uncertainty"]
     found = {i: 200.0 * u[i] / abs(s) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None}
     return {i: pct for i, pct in found.items() if math.isfinite(pct)}
-
-
-def _gateway_row(
-    place: tuple[str, str],
-    sensors: int,
-    alive: bool,
-    told: GatewayTold | None,
-    refused: int,
-    doubled: Sequence[str],
-    in_turns: Sequence[str],
-    *,
-    retired: bool,
-) -> dict[str, Any]:
-    why = [] if alive or retired else ["the gateway is not on the bus"]
-    if doubled:
-        why.append(f"{len(doubled)} gateways are on the bus under this name ({_runs(doubled)})")
-    elif in_turns:
-        why.append(f"{_runs(in_turns)} {IN_TURNS}")
-    if told is not None and told.state not in CALM:
-        why.append(clipped(f"{told.state}: {'; '.join(told.reasons[:10])}"))
-    if refused:
-        why.append(f"{refused} results in its name were refused: no known key of this gateway signed them")
-    return {
-        "site": place[0],
-        "gateway": place[1],
-        "alive": alive,
-        "retired": retired,
-        "sensors": sensors,
-        "state": clipped(told.state) if told else "",
-        "version": clipped(told.version) if told else "",
-        "told_utc_ns": told.t_utc_ns if told else None,
-        "refused": refused,
-        "instances": max(len(doubled), 1),
-        "why": "; ".join(why),
-    }
 
 
 def _runs(ids: Sequence[str]) -> str:

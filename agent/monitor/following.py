@@ -86,8 +86,8 @@ class Following:
         def recall(place: Place) -> None:
             fleet.recall(place, database.history(*place, "drift", VERDICTS))
 
-        self._each(sorted(changed), recall)
-        self._each(newest, lambda place: fleet.take(*place, fresh=False))
+        self._take_each(sorted(changed), recall)
+        self._take_each(newest, lambda place: fleet.take(*place, fresh=False))
         self._thread = threading.Thread(target=self._run, name="following", daemon=True)
         self._thread.start()
 
@@ -143,7 +143,7 @@ class Following:
                 self._count_fault(error)
             self._stop.wait(RECONNECT_S)
 
-    def _each(self, things: Iterable[Any], take: Callable[[Any], object]) -> None:
+    def _take_each(self, things: Iterable[Any], take: Callable[[Any], object]) -> None:
         """Take things one by one; one that cannot be taken is counted, and the next one is taken."""
         for thing in things:
             try:
@@ -173,16 +173,16 @@ class Following:
             self._hearing.begin(session)
             ended = threading.Event()
             threads = [
-                threading.Thread(target=self._each, args=(tokens, self._take_token), name="presence", daemon=True),
-                threading.Thread(target=self._each, args=(told, self._take_status), name="health", daemon=True),
-                threading.Thread(target=self._each, args=(guides, self._take_guide), name="guides", daemon=True),
+                threading.Thread(target=self._take_each, args=(tokens, self._take_token), name="presence", daemon=True),
+                threading.Thread(target=self._take_each, args=(told, self._take_status), name="health", daemon=True),
+                threading.Thread(target=self._take_each, args=(guides, self._take_guide), name="guides", daemon=True),
                 threading.Thread(target=self._look, args=(consumer, ended), name="look", daemon=True),
             ]
             for thread in threads:
                 thread.start()
             self._not_received = ""
             try:
-                self._each(consumer.batches(BATCH), self._take)
+                self._take_each(consumer.batches(BATCH), self._take)
             finally:
                 ended.set()
                 tokens.undeclare()
@@ -197,7 +197,7 @@ class Following:
         shown = [result for result in confirmed if self._fleet.admits(result.address)]
         for result in shown:
             result.fields["signed_by"] = result.signed_by
-        self._each(self._keep(shown), self._show)
+        self._take_each(self._keep(shown), self._show)
 
     def _keep(self, results: Sequence[Received]) -> Sequence[Received]:
         """Add results to the database, as soon as it can be written; returns those that it has taken."""
@@ -241,7 +241,7 @@ class Following:
 
     def _take_status(self, sample: zenoh.Sample) -> None:
         if (address := parse_key(str(sample.key_expr))) is not None:
-            self._fleet.set_told(address.site, address.gateway, sample.payload.to_bytes())
+            self._fleet.set_gateway_status(address.site, address.gateway, sample.payload.to_bytes())
 
     def _take_guide(self, sample: zenoh.Sample) -> None:
         if (address := parse_key(str(sample.key_expr))) is None:

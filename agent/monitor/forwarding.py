@@ -70,5 +70,5 @@ class Forwarding:
 
     def _note(self, asked: QueryParams, words: str) -> None:
         site, gateway, sensor = asked["site"], asked["gateway"], asked["sensor"]
-        self._fleet.note(site, gateway, sensor, "command", time.time_ns(), words)
+        self._fleet.note((site, gateway, sensor), "command", time.time_ns(), words)
         _log.warning("%s/%s/%s: %s", site, gateway, sensor, words)

@@ -83,7 +83,7 @@ class Live:
                         yield ": no block\n\n"
                     if fresh and now_s - told_s >= MINUTE_EVERY_S:
                         fresh, told_s = False, now_s
-                        told = await anyio.to_thread.run_sync(minute.told)
+                        told = await anyio.to_thread.run_sync(minute.as_object)
                         yield f"event: minute\ndata: {json.dumps(told, allow_nan=False)}\n\n"
                     await asyncio.sleep(LOOK_S)
         except zenoh.ZError:

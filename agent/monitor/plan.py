@@ -50,7 +50,7 @@ class Plans:
         with engine.transaction() as run:
             engine.make_tables(run, [statement.format(bytes=engine.BYTES) for statement in _TABLES])
 
-    def told(self, _: Request) -> Response:
+    def positions(self, _: Request) -> Response:
         """`picture`: its version, "" where there is none; `positions` by sensor, as fractions."""
         with self._engine.transaction() as run:
             versions = run("SELECT sha256 FROM plan_picture")

@@ -27,7 +27,7 @@ from agent.monitor.live import Live
 from agent.monitor.login import Access
 from agent.monitor.notices import FleetWatch, NoticeSender
 from agent.monitor.plan import Plans
-from agent.monitor.server import application
+from agent.monitor.server import PageData, application
 from agent.monitor.settings import MonitorSettings
 from agent.monitor.site_watching import SiteWatching
 from agent.monitor.summaries import Summariser
@@ -93,9 +93,8 @@ def serve(listening: socket.socket, data_dir: Path, bus: BusAccess, web: Web, se
         if settings.notices is not None:
             notifier = NoticeSender(FleetWatch(fleet, settings.notices, _certificates(bus, web)), settings.notices)
             stack.callback(notifier.close)
-        app = application(
-            database, fleet, following, access, forwarding, live, stopping, plans, watching, web.names, notifier
-        )
+        data = PageData(database, fleet, following, stopping, watching, notifier)
+        app = application(data, access, forwarding, live, plans, web.names)
         server, bounded = web_server(app, listening, web, stopping)
         # The server raises the signal again that has ended it; SIGTERM would then end the process before what is below.
         signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -56,24 +56,12 @@ ALIVE_S = 15.0
 
 
 def application(
-    database: Database,
-    fleet: Fleet,
-    following: Following,
-    access: Access,
-    forwarding: Forwarding,
-    live: Live,
-    stopping: threading.Event,
-    plans: Plans,
-    watching: SiteWatching,
-    names: Sequence[str] = (),
-    notifier: NoticeSender | None = None,
+    data: PageData, access: Access, forwarding: Forwarding, live: Live, plans: Plans, names: Sequence[str] = ()
 ) -> ASGIApp:
     """The page, its data as JSON and CSV, and the stream of changes (server-sent events).
 
-    `stopping` ends the streams, which a browser would keep open for ever. `names`: host names by which browsers reach
-    this server, besides localhost and IP addresses. `notifier`: its fault is shown.
+    `names`: host names by which browsers reach this server, besides localhost and IP addresses.
     """
-    data = _Data(database, fleet, following, stopping, watching, notifier)
     app = Starlette(
         routes=[
             Route("/api/fleet", access.reading(data.sensors)),
@@ -85,7 +73,7 @@ def application(
             Route("/gateways.csv", access.reading(data.gateways_csv)),
             Route("/api/changes", access.reading_async(data.changes)),
             Route("/plan", access.reading(plans.picture)),
-            Route("/api/plan", access.reading(plans.told)),
+            Route("/api/plan", access.reading(plans.positions)),
             Route("/api/plan/picture", plans.put_picture, methods=["POST"]),
             Route("/api/plan/position", plans.put_position, methods=["POST"]),
             Route("/fleet.csv", access.reading(data.sensors_csv)),
@@ -122,12 +110,15 @@ def _no_database(_: Request, error: Exception) -> Response:
     return Response(f"the database cannot be read: {error}; try again", 503)
 
 
-class _Data:
-    """What the page asks for."""
+class PageData:
+    """What the page asks for. `stopping` ends the streams, which a browser would keep open for ever.
+
+    `notifier`: its fault is shown.
+    """
 
     def __init__(
         self, database: Database, fleet: Fleet, following: Following, stopping: threading.Event,
-        watching: SiteWatching, notifier: NoticeSender | None,
+        watching: SiteWatching, notifier: NoticeSender | None = None,
     ) -> None:  # fmt: skip
         self._database, self._fleet, self._following, self._stopping = database, fleet, following, stopping
         self._watching, self._notifier = watching, notifier

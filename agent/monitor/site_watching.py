@@ -22,9 +22,9 @@ import numpy as np
 from agent.monitor.database import Database
 from agent.monitor.engines import DatabaseError
 from agent.monitor.fleet import Fleet
-from agent.monitor.watch_store import close_day, keep_told, sites_of, source_of, told_of
+from agent.monitor.watch_store import close_day, keep_verdict, sites_of, source_of, verdicts_of_sites
 from agent.site_watch.suspicion import Suspicion
-from agent.site_watch.view import as_object, seen
+from agent.site_watch.view import as_object, watch_site
 from calib.recorded.outcome import plain
 from calib.site_watch.day import HOURS
 
@@ -49,7 +49,7 @@ class SiteWatching:
         self._changed: set[str] = set()
         self._rests: dict[str, float] = {}  # until when a site is not asked
         self.told: dict[str, dict[str, Any]] = {}
-        for site, told in told_of(database.query).items():
+        for site, told in verdicts_of_sites(database.query).items():
             try:
                 fleet.set_suspected(site, _suspicions(told), int(told["until_day"]) * DAY_NS, fresh=False)
             except (msgspec.ValidationError, KeyError, TypeError, ValueError):  # damaged on the disk: told anew
@@ -85,7 +85,7 @@ class SiteWatching:
         """The sites of which the structure has changed: `site`, `what`, `since`, `earliest`, `latest`."""
         names = "since", "earliest", "latest"
         return [
-            {"site": site, "what": _what(told["site"])} | {name: told["site"][name] for name in names}
+            {"site": site, "what": _change_text(told["site"])} | {name: told["site"][name] for name in names}
             for site, told in sorted(self.told.items())
             if told["site"]["verdict"] == "structure"
         ]
@@ -95,14 +95,14 @@ class SiteWatching:
         if not source.sensors:
             return
         source.left_out = Counter(self._database.watch.left_out)  # of all sites, since the start
-        view = seen(source)
+        view = watch_site(source)
         told = plain(as_object(view)) | {"until_day": view.found.day}
         before, self.told[site] = self.told.get(site), msgspec.json.decode(msgspec.json.encode(told))
         structure = self.told[site]["site"]
         if structure["verdict"] == "structure" and (before is None or before["site"]["verdict"] != "structure"):
-            text = f"structure: {_what(structure)} since {structure['since']}"
-            self._fleet.note(site, "all", "structure", "watch", view.found.day * DAY_NS + DAY_NS, text, alarm=True)
-        keep_told(self._database.query, site, view.found.day, self.told[site])
+            text = f"structure: {_change_text(structure)} since {structure['since']}"
+            self._fleet.note((site, "all", "structure"), "watch", view.found.day * DAY_NS + DAY_NS, text, alarm=True)
+        keep_verdict(self._database.query, site, view.found.day, self.told[site])
         self._fleet.set_suspected(site, _suspicions(self.told[site]), view.found.day * DAY_NS + DAY_NS)
 
     def _turn(self) -> None:
@@ -134,7 +134,7 @@ def _suspicions(told: dict[str, Any]) -> dict[tuple[str, str], Suspicion]:
     return {(one.gateway, one.sensor): one for one in found}
 
 
-def _what(told: dict[str, Any]) -> str:
+def _change_text(told: dict[str, Any]) -> str:
     """What has changed of a structure, with its size where there is one."""
     size, U = told["size"], told["expanded_uncertainty"]
     return told["what"] if size is None or U is None else f"{told['what']}, by {size:+.2f} ± {U:.2f} %"

@@ -41,7 +41,7 @@ class LastMinute:
         while len(self._blocks) > 1 and self._count - len(self._blocks[0].acceleration) >= self._most(block):
             del self._blocks[0]
 
-    def told(self) -> dict[str, Any]:
+    def as_object(self) -> dict[str, Any]:
         """The course and the density as JSON can hold them. Without `segments` there is no density yet."""
         block = self._blocks[-1]
         values = np.vstack([each.acceleration for each in self._blocks])[-self._most(block) :]

@@ -52,13 +52,13 @@ class Trends:
         key = place, str([self._fleet.status(place), *((v["parameter"], v["verdict"]) for v in verdicts)])
         kept_s, found = self._kept.get(key, (-KEPT_FOR_S, {}))
         if time.monotonic() - kept_s >= KEPT_FOR_S:
-            found = self._found(place, verdicts)
+            found = self._compute(place, verdicts)
             if len(self._kept) >= KEPT_MAX:
                 self._kept.pop(next(iter(self._kept)), None)
             self._kept[key] = time.monotonic(), found
         return found
 
-    def _found(self, place: Place, verdicts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    def _compute(self, place: Place, verdicts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         history = self._database.spread(*place, "calibration", POINTS if verdicts else THINNED)
         if not history:
             return {}

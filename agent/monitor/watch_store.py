@@ -335,7 +335,7 @@ def from_database(path: Path, site: str | None) -> Iterator[SiteSource]:
         raise WatchError(f"{path}: no database of the monitor: {error}") from None
 
 
-def told_of(query: QueryRunner) -> dict[str, dict[str, Any]]:
+def verdicts_of_sites(query: QueryRunner) -> dict[str, dict[str, Any]]:
     """What was told last of each site: the object of docs/site-watch.md. One that is damaged is left out."""
     found = {}
     for site, told in query("SELECT site, told FROM watch_site"):
@@ -346,7 +346,7 @@ def told_of(query: QueryRunner) -> dict[str, dict[str, Any]]:
     return found
 
 
-def keep_told(query: QueryRunner, site: str, day: int, told: dict[str, Any]) -> None:
+def keep_verdict(query: QueryRunner, site: str, day: int, told: dict[str, Any]) -> None:
     """Keep what is told of a site, in the place of what was told before."""
     query(
         "INSERT INTO watch_site VALUES (:site, :day, :told) ON CONFLICT (site) DO UPDATE SET day = excluded.day,"

@@ -27,7 +27,7 @@ class SqliteBag(Bag):
         name = f"file:{quote(str(self.path.absolute()))}?mode=ro&immutable=1"
         try:
             with closing(sqlite3.connect(name, uri=True)) as file:
-                self._declare_all(file)
+                self._declare_topics(file)
                 for number, time_ns, data in self._rows(file):
                     count += 1
                     if number in self.channels and isinstance(time_ns, int) and isinstance(data, bytes):
@@ -52,7 +52,7 @@ class SqliteBag(Bag):
                 f"`sqlite3 {self.path.name} 'PRAGMA wal_checkpoint'` on copies of both files"
             )
 
-    def _declare_all(self, file: sqlite3.Connection) -> None:
+    def _declare_topics(self, file: sqlite3.Connection) -> None:
         """Keep the topics as channels, with the definitions of their types. Raises sqlite3.Error, TableError."""
         file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LONGEST)
         file.execute("PRAGMA trusted_schema = OFF")

@@ -20,7 +20,7 @@ MIDDLE = (0.25, 0.75)
 NEAR_ONE = 0.2  # relative; Livox-SDK/livox_ros_driver pull request 98 shows 0.88 g at rest
 
 
-def told_in_g(path: Path, option: str, chosen: Sequence[ChosenColumn], values: Slices) -> tuple[str, ...]:
+def unit_warning(path: Path, option: str, chosen: Sequence[ChosenColumn], values: Slices) -> tuple[str, ...]:
     """A line where time, x, y and z (`chosen`) state m/s2, but `values` (n, 3) have the magnitude 1 at rest.
 
     The magnitude is that of the mean of MEANT samples, so that neither motion nor turning matters. It must be near 1 in

@@ -44,12 +44,12 @@ class PublisherStream:
         time, equal samples are nothing unusual: then it must have been recorded at the same time too.
         """
         order = self._order()
-        bursts = any((_same(rows, before, [TIME]) & ~_same(rows, before, [CHECK])).any()
+        bursts = any((_equal_rows(rows, before, [TIME]) & ~_equal_rows(rows, before, [CHECK])).any()
                      for rows, before in self._pairs(order))  # fmt: skip
         told = [k for k in range(self._spool.width) if bursts or k != self._spool.width + LOGGED]
         self.doubled = 0
         for rows, before in self._pairs(order):
-            again = _same(rows, before, told)
+            again = _equal_rows(rows, before, told)
             self.doubled += int(again.sum())
             yield rows[~again, :LOGGED]
 
@@ -106,7 +106,7 @@ class PublisherStream:
             last = rows[-1:]
 
 
-def _same(rows: Array, before: Array, columns: list[int]) -> NDArray[np.bool_]:
+def _equal_rows(rows: Array, before: Array, columns: list[int]) -> NDArray[np.bool_]:
     """Which rows have the same bytes as those before, in these columns."""
     a, b = (np.ascontiguousarray(each[:, columns]).view(np.uint64) for each in (rows, before))
     return np.asarray((a == b).all(axis=1))

@@ -16,13 +16,13 @@ TIMES = ("log_time", "publish_time")  # of the message in the MCAP file
 CHANNELS = ("x", "y", "z", "a", "v", "d")
 
 
-def _known(unit: str) -> str:
+def _check_unit(unit: str) -> str:
     if unit_of(unit) is None:
         raise ValueError(f"the unit {unit!r} is not known; known are {', '.join(UNITS)}")
     return unit
 
 
-Unit = Annotated[str, AfterValidator(_known)]
+Unit = Annotated[str, AfterValidator(_check_unit)]
 FieldPath = Annotated[str, Field(max_length=256)]
 
 

@@ -36,13 +36,13 @@ class RecordingSource(Source):
         self._utc_ns = start.t_utc_ns - start.t_monotonic_ns
         if abs(self._utc_ns) >= 1 << 63:
             raise self._fault(f"it begins {start.t_utc_ns} ns after 1970, {start.t_monotonic_ns} ns after a boot")
-        devices = self._told(start.config_json, "devices")
+        devices = self._description(start.config_json, "devices")
         units: dict[str, str] = {}
         filters: dict[str, tuple[str, ...]] = {}
         columns: dict[str, list[Column]] = {}
         for event in self._events():
             if isinstance(event, DeviceChange) and event.info_json:
-                units[event.device] = str(self._told(event.info_json, "unit"))
+                units[event.device] = str(self._description(event.info_json, "unit"))
                 filters[event.device] = self._filters(event)
             if isinstance(event, SampleBlock) and event.device not in columns:
                 columns[event.device] = _columns(event, units.get(event.device, "count"))
@@ -53,7 +53,7 @@ class RecordingSource(Source):
         self.columns = [column for name in sorted(columns) for column in columns[name]]
         self.filters = filters
 
-    def _told(self, text: str, name: str) -> Any:
+    def _description(self, text: str, name: str) -> Any:
         """What the configuration or the description of a device says. Raises TableError."""
         try:
             return json.loads(text)[name]

@@ -133,12 +133,12 @@ class RosBag(Source):
             raise TableError(f"{told}; no message is there; record it anew, or write the file anew from its source")
         if not any(channel.is_read for channel in channels.values()):
             raise TableError(
-                f"{self.path}, topics: no topic can be read; the topics are {self._told()}; only messages of ROS with "
-                "ros2msg in CDR, or with ros1msg, are read: write the samples as CSV"
+                f"{self.path}, topics: no topic can be read; the topics are {self._topics_text()}; only messages "
+                "of ROS with ros2msg in CDR, or with ros1msg, are read: write the samples as CSV"
             )
         raise TableError(
-            f"{self.path}, topics: no topic is {IMU} that can be read; the topics are {self._told()}; state the fields "
-            "of others with --mapping"
+            f"{self.path}, topics: no topic is {IMU} that can be read; the topics are {self._topics_text()}; state the "
+            "fields of others with --mapping"
         )
 
     def _mapped(self, mapping: Mapping[str, Topic]) -> dict[str, Topic]:
@@ -148,12 +148,13 @@ class RosBag(Source):
             names = [n for n, (number, _) in self._senders.items() if topic in (n, self._bag.channels[number].topic)]
             if not names:
                 raise TableError(
-                    f"{self.path}, topics: there is no topic {topic!r} with messages; the topics are {self._told()}"
+                    f"{self.path}, topics: there is no topic {topic!r} with messages; "
+                    f"the topics are {self._topics_text()}"
                 )
             found |= dict.fromkeys(names, fields)
         return found
 
-    def _told(self) -> str:
+    def _topics_text(self) -> str:
         """The topics with their types, for messages."""
         numbers = dict.fromkeys(number for number, _ in self._senders.values())
         return ", ".join(str(self._bag.channels[number]) for number in numbers) or "none"

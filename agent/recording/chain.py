@@ -74,7 +74,7 @@ def unproven(links: Sequence[ChainLink], statements: Sequence[Deleted] = (), *, 
         elif before.number + 1 == after.number and not after.previous_sha256:
             yield f"that {after.path} follows {before.path}, which was not closed yet when the other one began"
     if whole:
-        yield from _deleted_ones(order, by_recordings, statements)
+        yield from _deletions(order, by_recordings, statements)
         yield from _unnamed(entries, statements)
 
 
@@ -214,7 +214,7 @@ def _misnamed(links: Sequence[ChainLink]) -> Iterator[tuple[int, str]]:
             yield index, f"its name is not the one of recording {link.file_sequence}, which it holds"
 
 
-def _deleted_ones(
+def _deletions(
     order: Sequence[tuple[int, ChainLink]], by_recordings: Sequence[Deleted], statements: Sequence[Deleted]
 ) -> Iterator[str]:
     numbers = [0, *(link.number for _, link in order)]

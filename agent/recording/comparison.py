@@ -95,13 +95,13 @@ def differences(
         for i, (x, y) in enumerate(zip(a, b, strict=True)):
             yield from differences(x, y, tolerance, f"{where}[{i}]", scale)
     elif isinstance(a, float) and isinstance(b, float):
-        if not _same(a, b, tolerance, scale):
+        if not _equal(a, b, tolerance, scale):
             yield where, a, b
     elif type(a) is not type(b) or a != b:
         yield where, a, b
 
 
-def _same(a: float, b: float, tolerance: float, scale: float) -> bool:
+def _equal(a: float, b: float, tolerance: float, scale: float) -> bool:
     if struct.pack("<d", a) == struct.pack("<d", b):
         return True
     if tolerance == 0 or not (math.isfinite(a) and math.isfinite(b)):
@@ -134,7 +134,7 @@ def _close(numbers: Mapping[str, float], threshold: str) -> bool:
 
 
 def _agree(recorded: Mapping[str, float], computed: Mapping[str, float], names: Sequence[str]) -> bool:
-    return all(name in recorded and _same(recorded[name], computed[name], OTHER_CPU, 0.0) for name in names)
+    return all(name in recorded and _equal(recorded[name], computed[name], OTHER_CPU, 0.0) for name in names)
 
 
 def empty_fields(item: Output) -> set[str]:

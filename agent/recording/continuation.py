@@ -14,8 +14,8 @@ UNKEPT_MAX = 1_000_000
 def continues(before: Iterable[Memory], kept: Iterable[Memory], sensors: Collection[str]) -> str:
     """Why a run does not begin with the states that were left for it; "" where it does.
 
-    `before`: what the recordings before it left (`left`). `kept`: `Pipeline.all_memories` of the snapshot in the first
-    RunStart of the run. `sensors`: those of its configuration; the states of others wait for a later run.
+    `before`: what the recordings before it left (`states_left`). `kept`: `Pipeline.all_memories` of the snapshot in the
+    first RunStart of the run. `sensors`: those of its configuration; the states of others wait for a later run.
     """
     were = {device: state for device, state in _by_device(before).items() if device[0] in sensors}
     are = _by_device(kept)
@@ -25,7 +25,7 @@ def continues(before: Iterable[Memory], kept: Iterable[Memory], sensors: Collect
     return ""
 
 
-def left(known: Iterable[Memory], end: Iterable[Memory], sensors: Collection[str]) -> list[Memory]:
+def states_left(known: Iterable[Memory], end: Iterable[Memory], sensors: Collection[str]) -> list[Memory]:
     """The states that recordings left: those at the end of the newest one, and those of sensors that it does not have.
 
     `known`: what the recordings before it left. `end`: `Pipeline.all_memories` where it ends, by a replay. `sensors`:

@@ -180,7 +180,7 @@ def _fault_1(metadata: dict[str, str], sha256: bytes, keys: KnownKeys, gateway: 
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
     key_id = metadata.get("key_id", "")
-    public_key = keys.named(gateway, key_id)
+    public_key = keys.key_named(gateway, key_id)
     if public_key is None:
         return keys.other_key(gateway, key_id)
     if fault := keys.fault(gateway, public_key):

@@ -35,7 +35,7 @@ def draw(material: Material, shown: Residuals | None, directory: Path) -> list[D
 
 
 def _figures(material: Material, shown: Residuals | None) -> Iterator[tuple[str, str, Figure | None]]:
-    results, unit = [r.shown for r in material.results], material.results[0].unit
+    results, unit = [r.in_display_units for r in material.results], material.results[0].unit
     several = len(results) > 1
     named = [(f"-{k + 1}" if several else "", f", {r.label}" if several else "", r) for k, r in enumerate(results)]
     for number, about, result in named:

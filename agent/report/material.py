@@ -16,7 +16,7 @@ from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 from agent.core.memory import Memory
 from agent.core.outcome import with_budget
 from agent.core.past import PastError, budget_in_force
-from agent.delivery.calibrations import calibrations, made
+from agent.delivery.calibrations import calibrations, first_in_force
 from agent.delivery.evidence import evidence
 from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.recording.files import recordings
@@ -172,7 +172,7 @@ def _results(records: Iterable[StoredResult | None], kind: type[Kind]) -> list[K
 def _run_of(history: History, sensor: str, in_force: StoredResult | None) -> str:
     """The run in which the calibration in force was made. If none is in force, the run of the newest window."""
     if in_force is not None:
-        return made(in_force)[0]
+        return first_in_force(in_force)[0]
     return next((window.run_id for window in history.newest(sensor, "window", limit=1)), "")
 
 

@@ -52,7 +52,7 @@ def _summary(result: CalibrationResult, *, several: bool) -> Iterator[str]:
         yield _box("Refused, because" if result.refused else "Please note", result.reasons)
     if not result.determined.any():
         return
-    yield tables.matrix(result.shown)
+    yield tables.matrix(result.in_display_units)
     unit, kind = offset_unit(result.unit), result.fields.get("uncertainty_kind")
     s_unit = sensitivity_unit(result.unit)
     s_words = f"S without a dimension, in {unit} per {ACCELERATION}" if s_unit == "1" else f"S in {s_unit}"
@@ -88,17 +88,18 @@ def _tables_of(result: CalibrationResult, seen: Sequence[Residuals]) -> list[tup
     """Heading, whether there is anything to show, and what makes it."""
     fields, determined = result.fields, bool(result.determined.any())
     return [
-        ("Parameters", determined, lambda: tables.parameters(result.shown)),
+        ("Parameters", determined, lambda: tables.parameters(result.in_display_units)),
         ("Main sensitivities over frequency, with U", bool(result.frequencies.bands),
-         lambda: tables.over_frequency(result.shown)),
-        ("Uncertainty budget: u by source", bool(result.budget) and determined, lambda: tables.budget(result.shown)),
+         lambda: tables.over_frequency(result.in_display_units)),
+        ("Uncertainty budget: u by source", bool(result.budget) and determined,
+         lambda: tables.budget(result.in_display_units)),
         ("Nuisances", bool(fields.get("nuisances")), lambda: tables.nuisances(result)),
         ("Statistics (Appendix A)", bool(fields.get("statistics")), lambda: tables.statistics(fields["statistics"])),
         ("Residuals, root mean square", bool(seen), lambda: tables.left_over(seen, result)),
         ("Windows", bool(result.windows), lambda: tables.windows(result)),
         ("Options", True, lambda: tables.facts(fields.get("options") or {})),
-        ("Further", True, lambda: tables.facts(result.more)),
-        ("Covariance", determined, lambda: tables.covariance(result.shown)),
+        ("Further", True, lambda: tables.facts(result.other_members)),
+        ("Covariance", determined, lambda: tables.covariance(result.in_display_units)),
     ]  # fmt: skip
 
 

@@ -121,7 +121,7 @@ class CalibrationResult:
         return self.values[9:]
 
     @property
-    def shown(self) -> CalibrationResult:
+    def in_display_units(self) -> CalibrationResult:
         """The same in the units in which people read S and Q, which `agent.report.units` names: g/g and mg for g."""
         factors = shown_in(self.unit).factors
         return replace(
@@ -140,7 +140,7 @@ class CalibrationResult:
         return tuple(map(str, self.fields.get("warnings") or ()))
 
     @property
-    def more(self) -> dict[str, Any]:
+    def other_members(self) -> dict[str, Any]:
         """Members of the object that no other table shows."""
         return {name: value for name, value in self.fields.items() if name not in SHOWN}
 

@@ -24,7 +24,7 @@ def retrace(result: CalibrationResult, directory: Path) -> tuple[dict[str, Trace
     options = result.fields.get("options")
     if not isinstance(options, dict) or not (options.get("poses") or options.get("rotation")):
         return {}, []
-    found, hindrances = _found(result.files, directory)
+    found, hindrances = _find_files(result.files, directory)
     if hindrances:
         return {}, [f"{hindrance}, so indications and residuals are not shown" for hindrance in hindrances]
     try:
@@ -37,7 +37,7 @@ def retrace(result: CalibrationResult, directory: Path) -> tuple[dict[str, Trace
     return _traces(read, result), []
 
 
-def _found(files: tuple[SourceFile, ...], directory: Path) -> tuple[dict[Any, Path], list[str]]:
+def _find_files(files: tuple[SourceFile, ...], directory: Path) -> tuple[dict[Any, Path], list[str]]:
     """The present path of each file, by its path in the result, and the files that are missing or changed."""
     found: dict[Any, Path] = {}
     hindrances = []

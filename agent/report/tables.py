@@ -10,7 +10,7 @@ import numpy as np
 
 from agent.report.result import CalibrationResult
 from agent.report.trace import Residuals
-from agent.report.units import offset_unit, output_unit, position_name, said, sensitivity_unit
+from agent.report.units import in_words, offset_unit, output_unit, position_name, sensitivity_unit
 from agent.terminal.text import page_text
 from calib.model import PARAMETERS
 from calib.output_unit import ACCELERATION
@@ -122,7 +122,7 @@ def statistics(held: Mapping[str, Any]) -> str:
         for name, of_name in runs.items()
         for k, run in enumerate(of_name, start=1)
     ]
-    return table(["parameter", "run", *(said(head) for head in heads)], rows) + rest
+    return table(["parameter", "run", *(in_words(head) for head in heads)], rows) + rest
 
 
 def _are_runs(value: list[Any]) -> bool:
@@ -164,7 +164,7 @@ def left_over(seen: Sequence[Residuals], result: CalibrationResult) -> str:
 
 def facts(pairs: Mapping[str, Any]) -> str:
     """Names and values."""
-    rows = [[said(name), _words(value)] for name, value in pairs.items() if value not in (None, "", [], {})]
+    rows = [[in_words(name), _words(value)] for name, value in pairs.items() if value not in (None, "", [], {})]
     return table(["", ""], rows, "words", frozenset({1})) if rows else ""
 
 
@@ -183,7 +183,8 @@ def _words(value: Any) -> str:
         held = {name: item for name, item in value.items() if item not in (None, "", [], {})}
         nests = {name for name, item in held.items() if isinstance(item, Mapping | list)}
         return ", ".join(
-            f"{said(name)} ({_words(v)})" if name in nests else f"{said(name)} {_words(v)}" for name, v in held.items()
+            f"{in_words(name)} ({_words(v)})" if name in nests else f"{in_words(name)} {_words(v)}"
+            for name, v in held.items()
         )
     if isinstance(value, list | tuple):
         return ", ".join(f"({_words(v)})" if isinstance(v, list | Mapping) else _words(v) for v in value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib.output_unit import ACCELERATION, shown_in, written
+from calib.output_unit import ACCELERATION, shown_in, unit_text
 
 _REFERENCES = {
     "acceleration": "reference accelerometer",
@@ -13,7 +13,7 @@ _REFERENCES = {
 
 def output_unit(stated: str) -> str:
     """The unit of V; "output unit" if the result does not state it."""
-    return written(stated)
+    return unit_text(stated)
 
 
 def sensitivity_unit(stated: str) -> str:
@@ -48,7 +48,7 @@ _SUFFIXES = {
 }
 
 
-def said(name: str) -> str:
+def in_words(name: str) -> str:
     """A field's name in words, its suffix as the unit: `rate_hz` is `rate in Hz`.
 
     Names of registers are not changed.

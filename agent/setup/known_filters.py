@@ -24,7 +24,7 @@ class StatedFilters:
     stated_by: str
 
     @property
-    def told(self) -> str:
+    def line(self) -> str:
         """One line for people."""
         if not self.stated_by:
             return f"filters of {self.device}: none stated; {ESTIMATED}"

@@ -108,11 +108,11 @@ def _understood(line: _PortBytes, baud_rate: int) -> PortLines | str:
     decoded = decode(_text(lines), count)
     values = decoded.values
     if len(values) < FEWEST_LINES:
-        return f"no lines of numbers at {baud_rate} baud{_why(decoded, lines, count)}"
+        return f"no lines of numbers at {baud_rate} baud{_unreadable_reason(decoded, lines, count)}"
     first = int(decoded.line[0])  # before it, a board that was restarted may write what it likes
     unread = sum(at > first for at in decoded.bad_at)
     if unread > MOST_UNREAD * (len(values) + unread):
-        return f"{unread} of {len(values) + unread} lines cannot be read{_why(decoded, lines, count)}"
+        return f"{unread} of {len(values) + unread} lines cannot be read{_unreadable_reason(decoded, lines, count)}"
     begin += len(_text(lines[:first]))
     octets, arrivals = len(_text(lines[first:])), [arrival for arrival in line.arrivals if arrival[1] >= begin]
     if len(arrivals) < 2:
@@ -124,7 +124,7 @@ def _understood(line: _PortBytes, baud_rate: int) -> PortLines | str:
         tuple((values % 1 == 0).all(axis=0).tolist()),
         counted_hz,
         nominal_hz(counted_hz),
-        _shown(lines[int(decoded.line[-1])]),
+        _escaped(lines[int(decoded.line[-1])]),
     )
 
 
@@ -143,16 +143,16 @@ def _columns(kinds: Sequence[Column | None]) -> tuple[Column, ...] | None:
     return tuple(columns)
 
 
-def _why(decoded: Decoded, lines: Sequence[bytes], count: int) -> str:
+def _unreadable_reason(decoded: Decoded, lines: Sequence[bytes], count: int) -> str:
     """What is wrong with the last line that cannot be read; "" without one."""
     if not decoded.bad_at:
         return ""
     line = lines[decoded.bad_at[-1]]
     reason = next(iter(decode(line + b"\n", count).bad_lines), "no newline within the longest line")
-    return f" ({reason}, as {_shown(line)})"
+    return f" ({reason}, as {_escaped(line)})"
 
 
-def _shown(line: bytes) -> str:
+def _escaped(line: bytes) -> str:
     """A line of a device for a message: characters that a terminal would obey are escaped."""
     return repr(line[:EXAMPLE_BYTES].decode("ascii", "backslashreplace"))
 

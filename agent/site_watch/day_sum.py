@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.site_watch.hour import SelfTestLine, WatchHour, grid, places, values
 from calib.model import Array
@@ -148,10 +149,7 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
     made: list[Made | None] = [None] * n
     main, u_main = np.full((n, 3), np.nan), np.full(n, np.nan)
     for one in sums:
-        own = np.array([k for k, i in enumerate(one.sensors) if i in at], dtype=int)
-        to = np.array([at[one.sensors[k]] for k in own], dtype=int)
-        columns = np.array([k for k, band in enumerate(one.bands) if band in place], dtype=int)
-        to_bands = np.array([place[one.bands[k]] for k in columns], dtype=int)
+        (own, to), (columns, to_bands) = _common(one.sensors, at), _common(one.bands, place)
         value, u, level = np.full((n, b, 6), np.nan), np.full((n, b, 6), np.inf), np.full((b, 3), np.nan)
         noise, mean = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         value[to[:, None], to_bands] = one.array("value")[own[:, None], columns]
@@ -173,6 +171,12 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
             array[to] = one.array(name)[own]
         day = Day(one.number, value, u, level, noise, one.temperature_degc, mean, SelfTests(*tests), frequency)
         yield SiteDay(day, visits, u_main.copy())
+
+
+def _common(of_a_sum: Sequence[int], at: Mapping[int, int]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Which sensors, or bands, of a sum are among those `at` a place, and the places of these."""
+    own = [k for k, one in enumerate(of_a_sum) if one in at]
+    return np.array(own, dtype=int), np.array([at[of_a_sum[k]] for k in own], dtype=int)
 
 
 def _hz(bands: Sequence[int]) -> Array:

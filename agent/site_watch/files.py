@@ -169,7 +169,7 @@ def _read_recording(found: _Files, path: Path) -> None:
             elif isinstance(result, SelfTestReport):
                 found.tested(SelfTestLine(**_as_json(result, SelfTestLine)), gateway)
             elif isinstance(result, CalibrationUpdate):
-                line = CalibrationLine(sensor=result.sensor, sensitivity=_known(result.sensitivity),
+                line = CalibrationLine(sensor=result.sensor, sensitivity=_without_nan(result.sensitivity),
                                        run_id=result.made[0], sequence=result.made[1])  # fmt: skip
                 found.calibrated(line, gateway)
     if reader.fault is not None:
@@ -181,12 +181,12 @@ def _read_recording(found: _Files, path: Path) -> None:
 def _as_json(report: Result, kind: type[msgspec.Struct]) -> dict[str, Any]:
     """The fields that are used; None for NaN."""
     told = msgspec.structs.asdict(report)
-    return {name: _known(told[name]) for name in kind.__struct_fields__ if name in told}
+    return {name: _without_nan(told[name]) for name in kind.__struct_fields__ if name in told}
 
 
-def _known(value: Any) -> Any:
+def _without_nan(value: Any) -> Any:
     if isinstance(value, list):
-        return [_known(each) for each in value]
+        return [_without_nan(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

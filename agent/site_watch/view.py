@@ -87,7 +87,7 @@ class SiteView:
         return frequencies + [f"{one.gateway}/{one.sensor}: {one.text}" for one in told]
 
 
-def seen(source: SiteSource, beside_reference: Sequence[int] = ()) -> SiteView:
+def watch_site(source: SiteSource, beside_reference: Sequence[int] = ()) -> SiteView:
     """Watch the site over all its days. `beside_reference`: positions of the sensors that have one."""
     gateways, n = source.gateways, len(source.sensors)
     watch = SiteWatch(np.array([gateways.index(gateway) for gateway, _ in source.sensors]),
@@ -144,7 +144,7 @@ def _cells(told: SensorVerdict) -> tuple[str, str, str, str]:
     return verdict, sized(told), since(told), DO.get(told.kind, "")
 
 
-def not_seen(what: SiteView) -> list[str]:
+def blind_spots(what: SiteView) -> list[str]:
     """What this site cannot show, one sentence each."""
     found, names = what.found, what.source.sensors
     lines = []
@@ -190,14 +190,14 @@ def as_object(what: SiteView) -> dict[str, Any]:
         "until": date(found.day),
         "changed": what.changed,
         "limit": found.limit,
-        "site": _told(found.site),
-        "frequencies": [{"frequency_hz": one.hz, **_told(one)} for one in found.frequencies],
-        "gateways": {source.gateways[g]: _told(told) for g, told in found.gateways.items()},
+        "site": _verdict_object(found.site),
+        "frequencies": [{"frequency_hz": one.hz, **_verdict_object(one)} for one in found.frequencies],
+        "gateways": {source.gateways[g]: _verdict_object(told) for g, told in found.gateways.items()},
         "sensors": [
             {
                 "gateway": gateway,
                 "sensor": sensor,
-                **_told(found.sensors[i]),
+                **_verdict_object(found.sensors[i]),
                 "suspected": what.suspected(i),
                 "days": int(found.days[i]),
                 "last_day": date(int(what.last[i])) if what.last[i] else None,
@@ -210,15 +210,15 @@ def as_object(what: SiteView) -> dict[str, Any]:
         ],
         "visit_order": ["/".join(source.sensors[i]) for i, _ in what.order],
         "visits": [_visit(what, row) for row in what.visits.tolist()],
-        "common": None if found.common is None else _told(found.common),
-        "not_seen": not_seen(what),
+        "common": None if found.common is None else _verdict_object(found.common),
+        "not_seen": blind_spots(what),
         "lines": source.lines,
         "left_out": dict(source.left_out),
         "version": __version__,
     }
 
 
-def _told(told: SensorVerdict) -> dict[str, Any]:
+def _verdict_object(told: SensorVerdict) -> dict[str, Any]:
     unit, factor = ("rad", 1.0) if told.kind == "turn" else ("%", 100.0)
     dated, (size, U) = told.since >= 0, relative(told)
     return {

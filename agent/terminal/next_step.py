@@ -166,7 +166,7 @@ class NextSteps:
             return "wait for motion; the configuration states one position, so nothing has to be turned"
         if channel.positions == "free":
             return f"turn the clamp to another alpha and stay {STAY_S} s; three are needed, {len(seen.used)} are used"
-        return _stated(channel, seen) or "state further positions: those of the configuration are over"
+        return _next_stated(channel, seen) or "state further positions: those of the configuration are over"
 
 
 def _mend(seen: SensorProgress) -> str:
@@ -177,19 +177,19 @@ def _mend(seen: SensorProgress) -> str:
     return "mend what the reason of the newest windows names: they are refused one after the other"
 
 
-def _stated(channel: Channel, seen: SensorProgress) -> str | None:
+def _next_stated(channel: Channel, seen: SensorProgress) -> str | None:
     """Which of the stated positions is next; None if the configuration states no further one."""
     if channel.poses:
-        return _timed(channel, seen)
+        return _next_timed(channel, seen)
     stops = channel.stops
     if not stops:
         return "state positions, or rotation, in the configuration: without them no window tells S or Q"
     left = [stop for stop in stops if stop.position not in seen.used] or stops
     used = len(stops) - len(left) if left is not stops else len(stops)
-    return f"{_taken(left[0])} and stay {STAY_S} s (positions used: {used} of {len(stops)})"
+    return f"{_instruction(left[0])} and stay {STAY_S} s (positions used: {used} of {len(stops)})"
 
 
-def _timed(channel: Channel, seen: SensorProgress) -> str | None:
+def _next_timed(channel: Channel, seen: SensorProgress) -> str | None:
     """The next pose with times, first one that no window used; None after the last one."""
     after_s = seen.newest.stop_s if seen.newest else 0.0
     period_s = channel.poses_repeat_s
@@ -204,12 +204,12 @@ def _timed(channel: Channel, seen: SensorProgress) -> str | None:
     interval, pose = next((each for each in stated if each[1].position not in seen.used), stated[0])
     again = f", and every {period_s:g} s again" if period_s else ""
     return (
-        f"{_taken(pose)}; the configuration states that position from {interval.start_s:g} to {interval.stop_s:g} s "
-        f"after the first sample{again}"
+        f"{_instruction(pose)}; the configuration states that position from {interval.start_s:g} to "
+        f"{interval.stop_s:g} s after the first sample{again}"
     )
 
 
-def _taken(pose: Pose) -> str:
+def _instruction(pose: Pose) -> str:
     """How a person takes a position: a rest on a face of the housing by the axis that points up, else by its name."""
     length = float(np.linalg.norm(pose.gravity_mps2))
     if pose.direction.shape[1] == 0 and length > 0:

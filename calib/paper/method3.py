@@ -63,7 +63,7 @@ def fit(windows: Sequence[Window]) -> Fit:
     residual = (scatter + rest.T @ rest) / dof if dof > 0 else np.full((3, 3), np.nan)
     np.fill_diagonal(residual, np.maximum(np.diag(residual), 0.0))  # rounding may make it negative for exact data
     spread = whitened @ whitened.T
-    seen = _seen(right[kept])
+    seen = _excited_columns(right[kept])
     calibration = _calibration(solution, residual, spread, seen, float(dof))
     condition = float(singular[0] / singular[-1]) if rank == design.shape[1] else float("inf")
     return Fit(calibration, np.sqrt(np.diag(residual)), rank, condition, points)
@@ -107,7 +107,7 @@ def _to_parameters(pose: Pose) -> Array:
     return np.vstack([np.append(pose.gravity_mps2, 1.0), np.hstack([pose.direction.T, np.zeros((m, 1))])])
 
 
-def _seen(rows: Array) -> NDArray[np.bool_]:
+def _excited_columns(rows: Array) -> NDArray[np.bool_]:
     """(4,) flags of the columns of (a_x, a_y, a_z, 1) that lie in the row space, so that they are determined."""
     return np.asarray(np.einsum("ij,ij->j", rows, rows) > 1.0 - 1e-9)
 

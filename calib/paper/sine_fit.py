@@ -9,6 +9,7 @@ uncertainty of the frequency.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -74,8 +75,7 @@ def three_parameter(time_s: ArrayLike, signals: ArrayLike, frequency_hz: float) 
         raise ValueError(f"frequency must be positive, is {frequency_hz:.6g} Hz")
     origin = float(t.mean())
     design = _design(2 * np.pi * frequency_hz * (t - origin))
-    x, spread, residual = _least_squares(design, y)
-    return _fit(frequency_hz, 0.0, origin, x, spread, residual, len(t))
+    return _fit(frequency_hz, 0.0, origin, _least_squares(design, y), len(t))
 
 
 def four_parameter(time_s: ArrayLike, signal: ArrayLike, frequency_hz: float | None = None) -> SineFit:
@@ -95,16 +95,16 @@ def four_parameter(time_s: ArrayLike, signal: ArrayLike, frequency_hz: float | N
     f = coarse_frequency_hz(t, signal) if frequency_hz is None else frequency_hz
     for _ in range(MAX_STEPS):
         design = _design(2 * np.pi * f * tau)
-        sine = _least_squares(design, y)[0][:2, 0]
+        sine = _least_squares(design, y).x[:2, 0]
         slope = tau * (design[:, 1] * sine[0] - design[:, 0] * sine[1])  # of the model by 2 pi f
-        x, spread, residual = _least_squares(np.column_stack([design, slope]), y)
-        step = float(x[3, 0]) / (2 * np.pi)
+        solved = _least_squares(np.column_stack([design, slope]), y)
+        step = float(solved.x[3, 0]) / (2 * np.pi)
         f += float(np.clip(step, -LONGEST_STEP_LINES * line_hz, LONGEST_STEP_LINES * line_hz))
         if f <= 0:
             break
         if abs(2 * np.pi * step) < CONVERGED_RAD * line_hz:
-            u_frequency = float(np.sqrt(spread[3, 3]) * residual[0] / (2 * np.pi))
-            return _fit(f, u_frequency, origin, x, spread, residual, len(t))
+            u_frequency = float(np.sqrt(solved.spread[3, 3]) * solved.residual[0] / (2 * np.pi))
+            return _fit(f, u_frequency, origin, solved, len(t))
     raise ValueError(f"no sine of one frequency in {len(t)} points over {np.ptp(t):.4g} s")
 
 
@@ -120,7 +120,7 @@ def coarse_frequency_hz(time_s: ArrayLike, signal: ArrayLike) -> float:
         raise ValueError("the signal does not move")
     lines = np.unique(np.maximum(max(int(np.argmax(spectrum)), 1) + SCAN_LINES, LEAST_LINES))
     tau = t - t.mean()
-    left = [_least_squares(_design(2 * np.pi * line_hz * line * tau), y)[2][0] for line in lines]
+    left = [_least_squares(_design(2 * np.pi * line_hz * line * tau), y).residual[0] for line in lines]
     return float(line_hz * lines[int(np.argmin(left))])
 
 
@@ -161,8 +161,16 @@ def _design(phase_rad: Array) -> Array:
     return np.column_stack([np.cos(phase_rad), -np.sin(phase_rad), np.ones_like(phase_rad)])
 
 
-def _least_squares(design: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Coefficients (p, c), (X'X)^-1 (p, p), residual SD (c,). Raises ValueError where the points do not carry them."""
+class _Solution(NamedTuple):
+    """Coefficients (p, c), (X'X)^-1 (p, p), residual SD (c,)."""
+
+    x: Array
+    spread: Array
+    residual: Array
+
+
+def _least_squares(design: Array, y: Array) -> _Solution:
+    """Raises ValueError where the points do not carry the coefficients."""
     q, r = np.linalg.qr(design)
     if np.abs(np.diag(r)).min() < 1e-10 * np.abs(np.diag(r)).max():
         raise ValueError("the points do not carry a sine of this frequency")
@@ -170,11 +178,12 @@ def _least_squares(design: Array, y: Array) -> tuple[Array, Array, Array]:
     x = inverse @ (q.T @ y)
     rest = y - design @ x
     freedom = len(y) - design.shape[1]
-    return x, inverse @ inverse.T, np.sqrt(np.einsum("nc,nc->c", rest, rest) / freedom)
+    return _Solution(x, inverse @ inverse.T, np.sqrt(np.einsum("nc,nc->c", rest, rest) / freedom))
 
 
-def _fit(f: float, u_f: float, origin: float, x: Array, spread: Array, residual: Array, points: int) -> SineFit:
+def _fit(f: float, u_f: float, origin: float, solved: _Solution, points: int) -> SineFit:
     """Turn coefficients (3, c) into phasors, with the first-order uncertainties of modulus and argument."""
+    x, spread, residual = solved
     phasor = x[0] + 1j * x[1]
     amplitude = np.abs(phasor)
     with np.errstate(invalid="ignore", divide="ignore"):

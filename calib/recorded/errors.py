@@ -23,9 +23,9 @@ class InputError(ValueError):
         )  # fmt: skip
 
     def __str__(self) -> str:
-        return self.told("row {}".format)
+        return self.message("row {}".format)
 
-    def told(self, row: Callable[[int], str]) -> str:
+    def message(self, row: Callable[[int], str]) -> str:
         """The message, with the number of the row in the words of `row`."""
         where = [self.place, "" if self.row is None else row(self.row), self.column and f"column {self.column}"]
         what = self.problem + (f"; {self.remedy}" if self.remedy else "")
@@ -47,6 +47,6 @@ class OptionError(InputError):
     `column` is the name of the option where one alone is wrong.
     """
 
-    def told(self, row: Callable[[int], str]) -> str:  # noqa: ARG002 - no option has rows
+    def message(self, row: Callable[[int], str]) -> str:  # noqa: ARG002 - no option has rows
         """The message."""
         return f"{self.column}: " * bool(self.column) + self.problem + f"; {self.remedy}" * bool(self.remedy)

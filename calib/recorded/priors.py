@@ -26,7 +26,7 @@ NOMINAL_TRANSVERSE = 0.03  # of the nominal sensitivity: data sheets of MEMS say
 
 def priors_of(options: Options) -> Priors:
     """The options u_..., nominal and prior as priors."""
-    parameters, covariance = _known(options)
+    parameters, covariance = _prior_calibration(options)
     told = replace(options, u_gravity_mps2=u_gravity_mps2(options))
     stated = {name: convert(getattr(told, option) or 0.0) for name, (option, convert) in STATED.items()}
     return Priors(stated, parameters, covariance).beside_known(known_response(options))
@@ -59,7 +59,7 @@ def u_gravity_mps2(options: Options) -> float:
     return U_STANDARD_GRAVITY_MPS2 if options.gravity is None else u_of_gravity_mps2(options.gravity)[0]
 
 
-def _known(options: Options) -> tuple[Array | None, Array | None]:
+def _prior_calibration(options: Options) -> tuple[Array | None, Array | None]:
     """Prior values (12,) and covariance (12, 12) of S and Q, from `nominal` or `prior`."""
     if options.nominal is not None and options.u_nominal_pct is not None:
         main, u = options.nominal, options.u_nominal_pct / 100.0

@@ -107,7 +107,7 @@ class Tables:
         settings = self._making.settings
         if not steady:
             settings = replace(settings, limits=settings.limits.unsteady)
-        found = self._made(settings, lag_s, response, progress)
+        found = self._make(settings, lag_s, response, progress)
         if not self._making.align or self._reference is None or self._phase_rad <= NEAR_RAD:
             return found
         if (told := drift(found)) is not None:
@@ -115,7 +115,7 @@ class Tables:
             if self._phase_rad <= BASIN_RAD and (told.significant if not self.rate else told.improves):
                 self._stretch(told.rate, told.time_s)
                 del found  # of a day, it would need as much memory once more
-                return self._made(settings, lag_s, response, progress)
+                return self._make(settings, lag_s, response, progress)
         return found
 
     @property
@@ -153,9 +153,9 @@ class Tables:
         """Windows that tell the response of each band by itself: no limit refuses what another response may explain,
         and no motion leaks from band to band."""
         settings = self._making.settings
-        return self._made(replace(settings, limits=settings.limits.of_any_response, taper=HANN), lag_s)
+        return self._make(replace(settings, limits=settings.limits.of_any_response, taper=HANN), lag_s)
 
-    def _made(
+    def _make(
         self,
         settings: Settings,
         lag_s: float,
@@ -168,7 +168,7 @@ class Tables:
             found = [
                 w
                 for piece in self._pieces(interval)
-                for w in self._windows(interval, *piece, lag_s, response, floor, settings)
+                for w in self._windows(interval, piece, lag_s, response, floor, settings)
             ]
             windows += found or [_nothing(interval, "no samples of the sensor, or none of the reference, in this pose")]
             if progress is not None:
@@ -195,14 +195,13 @@ class Tables:
     def _windows(
         self,
         interval: PoseInterval,
-        start_s: float,
-        stop_s: float,
+        span_s: tuple[float, float],
         lag_s: float,
         response: Response,
         floor: Array | None,
         settings: Settings,
     ) -> list[Window]:
-        sensor, reference = self._cut(interval, start_s, stop_s, lag_s, response)
+        sensor, reference = self._cut(interval, *span_s, lag_s, response)
         if sensor is None or (reference is None and interval.pose.direction.shape[1]):
             return []
         try:
@@ -211,14 +210,14 @@ class Tables:
                 sensor,
                 reference,
                 self._instrument,
-                (start_s, stop_s),
+                span_s,
                 lag_s,
                 settings,
                 floor,
                 response,
             )
         except Unusable as error:
-            return [nothing_in(interval.pose, start_s, stop_s, str(error))]
+            return [nothing_in(interval.pose, *span_s, str(error))]
         return [replace(w, sums=with_joined(w.sums, self._joined)) for w in found]
 
     def _cut(

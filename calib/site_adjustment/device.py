@@ -39,7 +39,7 @@ class SiteDevice:
     wide: Array
 
     @classmethod
-    def known(cls, name: str, mean: Array, covariance: Array) -> SiteDevice:
+    def with_covariance(cls, name: str, mean: Array, covariance: Array) -> SiteDevice:
         """With a covariance (n, n), as from a certificate; 0 on its diagonal is exact, inf is not known at all.
 
         The scale of what is not known comes from `mean`, which then only is the point where the adjustment begins.
@@ -62,12 +62,12 @@ class SiteDevice:
         """A reference with one standard uncertainty for the sensitivity of each of its 1 or 3 channels."""
         u = np.zeros(12)
         u[[0, 4, 8][:channels]] = relative_u
-        return cls.known(name, np.append(np.eye(3).ravel(), np.zeros(3)), np.diag(u**2))
+        return cls.with_covariance(name, np.append(np.eye(3).ravel(), np.zeros(3)), np.diag(u**2))
 
     @classmethod
     def gravity(cls, u_mps2: float) -> SiteDevice:
         """The error of the stated gravity, which all links share."""
-        return cls.known(GRAVITY_NAME, np.zeros(1), np.full((1, 1), u_mps2**2))
+        return cls.with_covariance(GRAVITY_NAME, np.zeros(1), np.full((1, 1), u_mps2**2))
 
 
 def beside(

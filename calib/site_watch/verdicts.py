@@ -140,8 +140,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
     n = watch.shape[0]
     anchored = np.zeros(n, dtype=bool) if known_u is None else np.isfinite(known_u)
     limit = limit_of(n, len(set(watch.gateway.tolist())))
-    days = watch.steps.days.reshape(watch.shape).max(axis=(1, 2))
-    sensors = [NOTHING if d >= FEWEST_DAYS + FEWEST_SINCE else SensorVerdict("learning") for d in days]
+    days, sensors = _begun(watch)
     gateways: dict[int, SensorVerdict] = {}
     site, common, least = NOTHING, None, np.full((n, 3), np.inf)
     changed = _frequencies(watch)
@@ -157,8 +156,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
         if known_u is not None and anchored.any():
             common = _common_change(tests, known_u[anchored], anchored)
         sensors = [witnessed(watch, i, told) for i, told in enumerate(sensors)]
-        month = int(np.argmin([abs(watch.day - begin + 1 - MONTH_DAYS) for begin in tests.begins]))
-        least = limit * tests.joint.u[month, :, :3]
+        least = _least_change(watch, tests, limit)
     common = common or _common_by_visits(watch)
     outside = (watch.degc < watch.seen_degc[:, 0]) | (watch.degc > watch.seen_degc[:, 1])
     hidden = common.U if common is not None else np.inf
@@ -176,6 +174,18 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
         limit,
         tuple(told for _, told in changed),
     )
+
+
+def _begun(watch: SiteWatch) -> tuple[Array, list[SensorVerdict]]:
+    """The days (n,) of each sensor since its last visit, and `learning` where they are too few."""
+    days = watch.steps.days.reshape(watch.shape).max(axis=(1, 2))
+    return days, [NOTHING if d >= FEWEST_DAYS + FEWEST_SINCE else SensorVerdict("learning") for d in days]
+
+
+def _least_change(watch: SiteWatch, tests: Tests, limit: float) -> Array:
+    """(n, 3) that equals the limit a month after it."""
+    month = int(np.argmin([abs(watch.day - begin + 1 - MONTH_DAYS) for begin in tests.begins]))
+    return np.asarray(limit * tests.joint.u[month, :, :3])
 
 
 def _begins(watch: SiteWatch) -> list[int]:

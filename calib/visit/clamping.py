@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -114,9 +115,8 @@ def clamping(windows: Sequence[Window], known: Array, covariance: Array, u_rotat
     residual = scatter[out, out] - slopes.T @ scatter[basis, out]
     inverse = np.linalg.pinv(scatter[basis, basis])[:3, :3]
     R = moved[0].pose.direction
-    turned_rad, spread = _turned(
-        slopes[:3].T, inverse, residual / (n * independent), n, mean[:3], mean[out], R, known, covariance,
-    )  # fmt: skip
+    regression = _Regression(slopes[:3].T, inverse, residual / (n * independent), n, mean[:3], mean[out])
+    turned_rad, spread = _turned(regression, R, known, covariance)
     total = spread + u_rotation_rad**2 * np.eye(3)
     chi2 = float(turned_rad @ np.linalg.solve(total, turned_rad))
     scale = float(np.sqrt(np.mean(known[[0, 4, 8]] ** 2)))
@@ -133,18 +133,27 @@ def clamping(windows: Sequence[Window], known: Array, covariance: Array, u_rotat
     )  # fmt: skip
 
 
-def _turned(
-    slopes: Array, inverse: Array, residual: Array, n: float, u: Array, V: Array, R: Array, known: Array,
-    covariance: Array,
-) -> tuple[Array, Array]:  # fmt: skip
-    """The rotation vector (3,) of T in rad and its covariance, by least squares on M, the means, and S and Q as known.
-
-    `slopes` (3, 3) have the covariance `residual` (3, 3) of one point times `inverse` (3, 3).
-    `u`, `V` are means over n points.
+class _Regression(NamedTuple):
+    """Of indications on the reference: `slopes` (3, 3) have the covariance `residual` (3, 3) of one point times
+    `inverse` (3, 3). `u`, `V` (3,) are means over `n` points.
     """
+
+    slopes: Array
+    inverse: Array
+    residual: Array
+    n: float
+    u: Array
+    V: Array
+
+
+def _turned(regression: _Regression, R: Array, known: Array, covariance: Array) -> tuple[Array, Array]:
+    """Rotation vector (3,) of T in rad and its covariance, by least squares on slopes, means, and S and Q as known."""
+    slopes, inverse, residual, n, u, V = regression
     S, Q = known[:9].reshape(3, 3).copy(), known[9:].copy()
     # The start: the rotation nearest to S^-1 M, each direction weighted by the motion and by gravity.
-    seen = R.T @ np.linalg.solve(S, np.column_stack([slopes @ _root(inverse), V - Q if _known(covariance) else V]))
+    seen = R.T @ np.linalg.solve(
+        S, np.column_stack([slopes @ _root(inverse), V - Q if _offset_determined(covariance) else V])
+    )
     left, _, right = np.linalg.svd(seen @ np.column_stack([_root(inverse), u]).T)
     T = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     noise = np.zeros((12, 12))
@@ -171,7 +180,7 @@ def _turned(
     return np.asarray(Rotation.from_matrix(T).as_rotvec()), np.asarray(np.linalg.inv(information)[12:, 12:])
 
 
-def _known(covariance: Array) -> bool:
+def _offset_determined(covariance: Array) -> bool:
     """Whether Q is known so well that gravity tells a direction."""
     return bool(np.trace(covariance[9:, 9:]) < np.trace(covariance[:9, :9]) * 100.0)
 

@@ -102,9 +102,9 @@ class JointCovariance:
         names = [*(q.key for q in S_AND_Q), *(Quantity(n.name, n.kind).key for n in found.nuisances)]
         own = np.array([False] * 12 + [n.kind in (REFERENCE, REFERENCE_DRIFT) for n in found.nuisances])
         scale = float(np.sqrt(np.mean(found.mean[[0, 4, 8]] ** 2)))
-        return cls(tuple(names), found.mean, found.covariance, scale)._given(own)
+        return cls(tuple(names), found.mean, found.covariance, scale)._conditional(own)
 
-    def _given(self, known: Flags) -> JointCovariance:
+    def _conditional(self, known: Flags) -> JointCovariance:
         """The same if the quantities `known` (N,) were exact."""
         rest = ~known
         shared = self.covariance[np.ix_(rest, known)]
@@ -264,7 +264,7 @@ class Plan:
 
         def left(known: str) -> Array:
             free = np.array([name != known for name in start.quantities])
-            given = start if known == "" else start._given(~free)
+            given = start if known == "" else start._conditional(~free)
             scale = np.sqrt(np.diag(given.covariance))
             precision = np.linalg.inv(given.covariance / np.outer(scale, scale))
             information = precision + told[np.ix_(free, free)] * np.outer(scale, scale)

@@ -214,7 +214,7 @@ class Building:
             shape = direction[None] / np.linalg.norm(direction)
         if any(p.across):
             shape = np.array([[p.across[0], 1.0, p.across[1]]])
-        return BuildingMotion(random, p.band, *self.span(visit), level, shape, response=response)
+        return BuildingMotion(random, p.band, self.span(visit), level, shape, response=response)
 
     def _device(
         self, role: Role, visit: int, harm: Harm, motion: BuildingMotion, elsewhere: BuildingMotion

@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 # Grid points per period of the upper end of the band: interpolation by cubic pieces is then accurate to 3e-6.
 POINTS_A_PERIOD = 32
+RAMP_S = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,7 @@ class BuildingSpectrum:
 
 
 class BuildingMotion:
-    """Acceleration (m/s2) from `start_s` to `stop_s`; it fades in and out within `ramp_s` and is zero outside.
+    """Acceleration (m/s2) within `span_s`; it fades in and out within RAMP_S and is zero outside.
 
     `shape` (C, 3): each of the C rows is a direction with its own random motion of `level_mps2` rms. The imaginary part
     of a complex row moves a quarter of a period ahead of the real part. `response` is that of a device at frequencies
@@ -48,14 +49,12 @@ class BuildingMotion:
         self,
         random: np.random.Generator,
         band: BuildingSpectrum,
-        start_s: float,
-        stop_s: float,
+        span_s: tuple[float, float],
         level_mps2: float,
         shape: Array | ComplexArray,
-        ramp_s: float = 0.4,
         response: Response | None = None,
     ) -> None:
-        self._start_s, self._stop_s, self._ramp_s = start_s, stop_s, ramp_s
+        self._start_s, self._stop_s = start_s, stop_s = span_s
         self._rate_hz = POINTS_A_PERIOD * band.high_hz
         points = _fast_length(int(np.ceil((stop_s - start_s) * self._rate_hz)) + 2)
         frequency_hz: Array = np.arange(points // 2 + 1) * np.float64(self._rate_hz / points)
@@ -79,7 +78,7 @@ class BuildingMotion:
         cell = place.astype(np.int64)
         x = place - cell
         # Cubic Hermite pieces: value and slope are exact at the grid points.
-        fade = _step((time_s - self._start_s) / self._ramp_s) * _step((self._stop_s - time_s) / self._ramp_s)
+        fade = _step((time_s - self._start_s) / RAMP_S) * _step((self._stop_s - time_s) / RAMP_S)
         a, b = (1 + 2 * x) * (1 - x) ** 2 * fade, x * (1 - x) ** 2 * fade
         c, d = x**2 * (3 - 2 * x) * fade, x**2 * (x - 1) * fade
         moved = np.zeros((len(time_s), 3))

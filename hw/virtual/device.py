@@ -41,7 +41,7 @@ class VirtualOptions(Options):
 
     @field_validator("preset")
     @classmethod
-    def _known(cls, value: str) -> str:
+    def _check_preset(cls, value: str) -> str:
         if value not in PRESETS:
             raise ValueError(f"no preset {value!r}; available: {', '.join(PRESETS)}")
         return value

@@ -77,6 +77,16 @@ class FifoTwin(ABC):
     def _set(self, register: int, value: int) -> None:
         """Write one register."""
 
+    def _reading(self, register: int, temperature: int, data: int) -> int:
+        """A byte of the temperature or of the newest sample, whose registers begin there with the high byte; of another
+        register its content."""
+        if temperature <= register < temperature + 2:
+            raw = self._temperature_raw(self._clock())
+            return raw.to_bytes(2, "big", signed=True)[register - temperature]
+        if data <= register < data + 6:
+            return self._newest().astype(">i2").tobytes()[register - data]
+        return self.registers[register]
+
     def _selected(self, address: int) -> int:
         """Register that the first byte of a write message selects."""
         return address

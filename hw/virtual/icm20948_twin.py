@@ -72,12 +72,7 @@ class Icm20948Twin(BankedTwin):
             return int(status)
         if register in (FIFO_COUNT, FIFO_COUNT + 1):
             return len(self._fifo).to_bytes(2, "big")[register - FIFO_COUNT]
-        if register in (TEMPERATURE, TEMPERATURE + 1):
-            raw = self._temperature_raw(self._clock())
-            return raw.to_bytes(2, "big", signed=True)[register - TEMPERATURE]
-        if DATA <= register < DATA + 6:
-            return self._newest().astype(">i2").tobytes()[register - DATA]
-        return self.registers[register]
+        return self._reading(register, TEMPERATURE, DATA)
 
     def _set(self, register: int, value: int) -> None:
         if register == POWER_1 and value & 0x80:

@@ -88,12 +88,7 @@ class Icm42688Twin(BankedTwin):
             if register == FIFO_COUNT + 1:
                 self._count = len(self._fifo) // (8 if self.registers[INTF_CONFIG0] & 0x40 else 1)
             return count
-        if register in (TEMPERATURE, TEMPERATURE + 1):
-            raw = self._temperature_raw(self._clock())
-            return raw.to_bytes(2, "big", signed=True)[register - TEMPERATURE]
-        if DATA <= register < DATA + 6:
-            return self._newest().astype(">i2").tobytes()[register - DATA]
-        return self.registers[register]
+        return self._reading(register, TEMPERATURE, DATA)
 
     def _set(self, register: int, value: int) -> None:
         if register == DEVICE_CONFIG and value & 0x01:

@@ -120,7 +120,9 @@ class Structure:
             random = generator(self.seed, NoiseStream.BUILDING_MOTION, sensor)
             response: Response | None = _on_a_spring if loose else None
             p = self.parameters
-            self._moves[key] = BuildingMotion(random, p.band, 0.0, PERIOD_S, p.level_mps2, np.eye(3), response=response)
+            self._moves[key] = BuildingMotion(
+                random, p.band, (0.0, PERIOD_S), p.level_mps2, np.eye(3), response=response
+            )
         return self._moves[key]
 
     def _white(self, device: int, first: int, n: int) -> Array:

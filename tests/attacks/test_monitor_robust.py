@@ -266,7 +266,7 @@ def stamps_rise(fleet: Fleet, before: int) -> int:
     steps: list[Callable[[], None]] = [
         lambda: fleet.take("site", "gw", "mems", "status", {"status": "VALID", "reason": "", "t_utc_ns": 1}),
         lambda: fleet.set_alive("site", "gw", True),
-        lambda: fleet.set_told("site", "gw", b'{"state": "degraded", "reasons": ["x"], "t_utc_ns": 1}'),
+        lambda: fleet.set_gateway_status("site", "gw", b'{"state": "degraded", "reasons": ["x"], "t_utc_ns": 1}'),
         lambda: fleet.take("site", "gw", "mems", "status", {"status": "HELD", "reason": "", "t_utc_ns": 2}),
         lambda: fleet.set_alive("site", "gw", False),
     ]

@@ -107,8 +107,10 @@ def test_invented_names_and_numbers_of_sensors_are_bounded(monkeypatch: pytest.M
         fleet.take("site", "gw", "s0", "drift", {"parameter": f"S{k}", "verdict": "stepped", "reason": "", "change": 1})
         fleet.take("site", "gw", "s0", f"invented{k}", {"sequence": k})
         fleet.set_alive("site", f"invented{k}", True)
-        fleet.set_told("site", "gw", b"[" * 100_000)
-        fleet.set_told("site", "gw", b'{"state": "running", "reasons": [], "t_utc_ns": 1' + b" " * 100_000 + b"}")
+        fleet.set_gateway_status("site", "gw", b"[" * 100_000)
+        fleet.set_gateway_status(
+            "site", "gw", b'{"state": "running", "reasons": [], "t_utc_ns": 1' + b" " * 100_000 + b"}"
+        )
     assert len(fleet.rows()) == 3
     assert set(fleet._newest["site", "gw", "s0"]) == {"status"}
     assert [row["gateway"] for row in fleet.gateways({})] == ["gw", "gw2"]
@@ -204,7 +206,7 @@ def test_no_text_of_the_bus_becomes_part_of_the_page(served: Served) -> None:
         served.database.add([Received("", address, number, fields, None)])
         served.fleet.take("site", "gw", "mems", what, fields)
     told = {"state": HOSTILE, "reasons": [HOSTILE], "version": HOSTILE, "t_utc_ns": 1}
-    served.fleet.set_told("site", "gw", msgspec.json.encode(told))
+    served.fleet.set_gateway_status("site", "gw", msgspec.json.encode(told))
     served.fleet.set_alive("site", "gw", True)
     served.following.benches.take("site", "gw", hostile_guide())
     sensor = "site=site&gateway=gw&sensor=mems"

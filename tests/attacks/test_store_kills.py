@@ -15,7 +15,7 @@ from agent.core.events import CalibrationUpdate, Event, RunStart
 from agent.core.memory import Memory
 from agent.core.snapshot import pack, unpack
 from agent.delivery.history import FILE_NAME
-from agent.recording.continuation import continues, left
+from agent.recording.continuation import continues, states_left
 from agent.recording.files import final_name, recordings
 from agent.recording.head import HEAD_NAME
 from agent.recording.messages import decode, encode
@@ -75,7 +75,7 @@ def test_a_gateway_that_is_killed_again_and_again_begins_each_run_with_what_the_
         assert continues(known, run.begun_with, ["s"]) == ""
         run.feed(list(rests(number, "AB"[number % 2]))[: 5 * number])
         run.stop() if number == 3 else run.kill()
-        known = left(known, run.pipeline.all_memories(), ["s"])
+        known = states_left(known, run.pipeline.all_memories(), ["s"])
     assert {identity.split()[1] for _, identity in states(known)} == {"A", "B"}
 
 

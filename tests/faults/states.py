@@ -15,7 +15,7 @@ from agent.core.pipeline import Pipeline
 from agent.delivery.gateway_key import GatewayKey
 from agent.delivery.history import FILE_NAME
 from agent.delivery.store import Store
-from agent.recording.continuation import continues, left
+from agent.recording.continuation import continues, states_left
 from agent.recording.files import recordings
 from agent.recording.reading import RecordingReader, first_event
 from agent.recording.signing import Signer
@@ -108,5 +108,5 @@ def broken_off(data_dir: Path) -> list[str]:
         if fault := continues(known, kept, sensors):
             faults.append(f"{path.name}: {fault}")
         end = memories_of(path, None, restore=Pipeline.restore)
-        known = left(known, end or [], sensors)
+        known = states_left(known, end or [], sensors)
     return faults

@@ -26,7 +26,7 @@ from agent.delivery.history import StoredResult
 from agent.delivery.keys import gateway_key
 from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
-from agent.fleet.simulated import SimulatedFleet, behaviours
+from agent.fleet.simulated import FleetPlan, SimulatedFleet, behaviours
 from agent.fleet.simulated_sensor import Behaviour
 from agent.monitor.settings import FloorPlan
 from agent.recording.acceleration import encode_acceleration
@@ -84,7 +84,7 @@ def page_site(
     numbers = [k for k, behaviour in enumerate(behaviours(gateways, SEED)) if behaviour not in without]
     with (
         Served(site, directory / "monitor", **options) as served,
-        SimulatedFleet(gateways, 2, SEED, [site.endpoint], directory / "fleet", numbers) as fleet,
+        SimulatedFleet(FleetPlan(gateways, 2, SEED, [site.endpoint], directory / "fleet"), numbers) as fleet,
     ):
         yield PageSite(served, fleet, 2 * len(numbers))
 

@@ -11,7 +11,7 @@ import ssl
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ from agent.monitor.following import Following
 from agent.monitor.forwarding import Forwarding
 from agent.monitor.live import Live
 from agent.monitor.login import Access
+from agent.monitor.notices import NoticeSender
 from agent.monitor.plan import Plans
 from agent.monitor.running import Web, web_server
-from agent.monitor.server import application
+from agent.monitor.server import PageData, application
 from agent.monitor.settings import FloorPlan
 from agent.monitor.site_watching import SiteWatching
 from tests.unit.zenoh_site import Site, wait_for
@@ -56,7 +57,8 @@ class Served(AbstractContextManager["Served"]):
 
     def __init__(
         self, site: Site, directory: Path, keys: Path | None = None, users: Path | None = None,
-        plan: FloorPlan | None = None, *, behind_proxy: bool = False, **more: Any,
+        plan: FloorPlan | None = None, *, behind_proxy: bool = False, names: Sequence[str] = (),
+        notifier: NoticeSender | None = None,
     ) -> None:  # fmt: skip
         self._open = ExitStack()
         directory.mkdir(exist_ok=True)
@@ -71,10 +73,8 @@ class Served(AbstractContextManager["Served"]):
         self.live = Live([site.endpoint], None, stopping)
         plans = Plans(engine, access, plan)
         self.watching = SiteWatching(self.database, self.fleet)
-        app = application(
-            self.database, self.fleet, self.following, access, forwarding, self.live, stopping, plans, self.watching,
-            **more,
-        )  # fmt: skip
+        data = PageData(self.database, self.fleet, self.following, stopping, self.watching, notifier)
+        app = application(data, access, forwarding, self.live, plans, names)
         listening = self._open.enter_context(closing(socket.create_server(("127.0.0.1", 0))))
         self.address = f"127.0.0.1:{listening.getsockname()[1]}"
         web = Web(names=(), users=users, certificate=None, key=None, behind_proxy=behind_proxy)

@@ -54,6 +54,13 @@ def test_the_warning_says_which_sign_and_which_row() -> None:
     assert [line.split(":")[0] for line in turned_by_180] == ["Sxx = -1, Syy = -1"]
 
 
+def test_a_copied_output_is_one_and_two_are_two() -> None:
+    (one,) = axis_warnings(SOUND[[0, 0, 2]])
+    assert one.startswith("output y holds the samples of another output")
+    (two,) = axis_warnings(SOUND[[0, 0, 0]])
+    assert two.startswith("output y and z hold the samples of another output")
+
+
 def test_a_column_that_is_not_known_leaves_the_others_to_be_judged() -> None:
     assert reasons([[26.0, 0.3, NAN], [0.2, 25.0, NAN], [0.1, 0.2, NAN]]) == []
     assert axis_warnings(np.array([[26.0, 0.3, NAN], [0.2, 25.0, NAN], [0.1, 0.2, NAN]])) == []

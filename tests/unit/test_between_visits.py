@@ -93,7 +93,7 @@ def test_a_step_before_or_after_both_visits_moves_nothing() -> None:
     for dates in (("2023-11-01", "2023-11-13"), ("2024-03-01", "2024-03-05")):
         step = told_step(since=dates[0], earliest=dates[0], latest=dates[1])
         assert a_of(between(step), 25.0) == pytest.approx(a_of(between(), 25.0), rel=1e-14)
-        assert all("on a line" in text for name, text in between(step).told.items() if name.startswith("between"))
+        assert all("on a line" in text for name, text in between(step).head.items() if name.startswith("between"))
 
 
 def test_u_holds_visits_walk_and_the_date_of_the_step() -> None:
@@ -132,7 +132,7 @@ def test_of_results_that_tell_a_calibration_again_the_first_is_used() -> None:
     grown = visit(30, 1.0, 0.0, u_pct=1.0, made_run_id="run", made_sequence=10, made_utc_ns=FIRST_NS)
     past = between_visits(CHANNEL, [grown, visit(LAST_DAY, 0.98, 1.0), first, grown], None)
     assert [one.t_utc_ns for one in past.calibrations] == [FIRST_NS, FIRST_NS + LAST_DAY * DAY_NS]
-    told = past.told
+    told = past.head
     assert told["calibration of 2023-11-14T00:00:00Z"] == "number 10 of run run, U 0.2 %, 0.2 %, 0.2 %"
     assert told["between 2023-11-14T00:00:00Z and 2024-02-22T00:00:00Z"].startswith("on a line, U 1")
 

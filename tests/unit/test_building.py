@@ -131,7 +131,7 @@ def test_some_visits_move_elsewhere() -> None:
 def test_motion_between_grid_points_is_the_band_limited_one() -> None:
     """A grid twice as fine gives the same motion: the cubic interpolation differs by 3e-6 of it."""
     band = BuildingSpectrum()
-    coarse = BuildingMotion(np.random.default_rng(1), band, 0.0, 20.0, 0.1, np.eye(3)[1:2])
+    coarse = BuildingMotion(np.random.default_rng(1), band, (0.0, 20.0), 0.1, np.eye(3)[1:2])
     lines = np.fft.rfft(coarse._value[:, 0])
     fine = np.fft.irfft(lines, 4 * len(coarse._value)) * 4
     time_s = np.arange(len(fine)) / (4 * 32 * band.high_hz)
@@ -229,7 +229,7 @@ def test_turned_swapped_and_far_away() -> None:
 def test_an_imaginary_share_moves_a_quarter_of_a_period_ahead() -> None:
     band = BuildingSpectrum(3.9, 4.1, ((4.0, 0.001),), flat=0.0)
     shape = np.array([[0.01j, 1.0, 0.02]])
-    motion = BuildingMotion(np.random.default_rng(1), band, 0.0, 60.0, 0.1, shape)
+    motion = BuildingMotion(np.random.default_rng(1), band, (0.0, 60.0), 0.1, shape)
     time_s = np.arange(5.0, 55.0, 0.01)
     moved, ahead = motion.at(time_s), motion.at(time_s + 1 / 16.0)
     np.testing.assert_allclose(moved[:, 2], 0.02 * moved[:, 1], atol=1e-12)

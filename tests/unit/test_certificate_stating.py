@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.cli.led import made, parsed
+from agent.cli.leading import calibrate_options, make_result
 from agent.cli.main import run_cli
 from tests.scenarios.processes import answered
 from tests.unit.certificates import STATED, run, uneven
@@ -112,9 +112,9 @@ def test_questions_are_asked_on_a_terminal(tmp_path: Path, result: Path) -> None
 @pytest.mark.slow
 def test_a_led_session_ends_with_the_certificate(tmp_path: Path) -> None:
     assert run_cli(["simulate", "--preset", "plain", "--csv", str(tmp_path)]) == 0
-    options = parsed([f"--{name}={tmp_path / name}.csv" for name in ("sensor", "reference", "poses")])
+    options = calibrate_options([f"--{name}={tmp_path / name}.csv" for name in ("sensor", "reference", "poses")])
     options["json_to"] = str(tmp_path / "result.json")
-    assert made(options, tmp_path, STATED) == 0
+    assert make_result(options, tmp_path, STATED) == 0
     assert (tmp_path / "certificate" / "certificate.pdf").exists()
 
 

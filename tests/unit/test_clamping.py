@@ -107,6 +107,6 @@ def test_u_grows_as_the_configuration_states():
     assert later.main_pct(days - 1.0) < 0.5 < later.main_pct(days + 1.0)
     assert later.days_until(0.4) == 0.0
     assert later.days_until(50.0) is None
-    told = later.told(0.5, datetime(2026, 1, 1, tzinfo=UTC))
+    told = later.as_object(0.5, datetime(2026, 1, 1, tzinfo=UTC))
     assert [a["months"] for a in told["after"]] == [0, 1, 3, 6, 12]
     assert told["exceeded_on"] > "2026-02-01"

@@ -10,7 +10,7 @@ import pytest
 
 from agent.config import ConfigError, load_config, parse_config
 from agent.config.faults import SHOWN_FAULTS
-from agent.config.reading import LARGEST_FILE, refused
+from agent.config.reading import LARGEST_FILE, config_error
 from agent.config.size import LONGEST_LIST
 
 DEVICES = """
@@ -159,8 +159,10 @@ def test_a_hostile_file_is_refused_soon_and_in_few_words(tmp_path: Path, text: s
 
 def test_faults_that_are_not_shown_are_counted() -> None:
     fault = (("a",), "wrong")
-    assert refused([fault] * SHOWN_FAULTS, "f", "").faults == ["f: a: wrong"] * SHOWN_FAULTS
-    assert refused([fault] * (SHOWN_FAULTS + 1), "f", "").faults[SHOWN_FAULTS:] == ["f: and 1 more faults, not shown"]
+    assert config_error([fault] * SHOWN_FAULTS, "f", "").faults == ["f: a: wrong"] * SHOWN_FAULTS
+    assert config_error([fault] * (SHOWN_FAULTS + 1), "f", "").faults[SHOWN_FAULTS:] == [
+        "f: and 1 more faults, not shown"
+    ]
 
 
 def test_files_of_tls_are_checked_with_the_rest(tmp_path: Path) -> None:

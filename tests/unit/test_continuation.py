@@ -9,7 +9,7 @@ import pytest
 
 from agent.core.memory import MOST_MEMORIES, Memory
 from agent.delivery.store import Store
-from agent.recording.continuation import continues, left
+from agent.recording.continuation import continues, states_left
 from tests.attacks.store_site import Run, rests, states
 
 A, B, OTHER = Memory("s", "A", 5, b"a"), Memory("s", "B", 5, b"b"), Memory("other", "A", 5, b"o")
@@ -37,11 +37,11 @@ def test_states_must_be_the_same_of_every_device_of_a_configured_sensor(
 
 
 def test_the_states_of_a_sensor_wait_until_it_is_configured_again() -> None:
-    known = left([], [A, OTHER], ["s", "other"])
-    known = left(known, [B], ["s"])
+    known = states_left([], [A, OTHER], ["s", "other"])
+    known = states_left(known, [B], ["s"])
     assert known == [OTHER, B]
     assert continues(known, [B, OTHER], ["s", "other"]) == ""
-    assert left(known, [], ["s"]) == [OTHER], "a configured sensor of which nothing is known has no state"
+    assert states_left(known, [], ["s"]) == [OTHER], "a configured sensor of which nothing is known has no state"
 
 
 def test_the_store_keeps_the_states_of_a_sensor_that_is_not_configured(tmp_path: Path) -> None:

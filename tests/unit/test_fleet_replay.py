@@ -24,7 +24,7 @@ from agent.core.events import CalibrationUpdate, RunStart, WindowReport
 from agent.core.pipeline import Pipeline
 from agent.fleet.results import Summary, results_of
 from agent.fleet.settings import ChangedSetting, SettingError
-from agent.fleet.sources import SourceError, found, local
+from agent.fleet.sources import SourceError, local, recordings_in
 from agent.fleet.task import Task, run_task
 from agent.fleet.workers import LocalWorkers, outcome
 from agent.recording.reading import RecordingReader
@@ -62,7 +62,7 @@ class Here(LocalWorkers):
 
 def here(place: Path, *settings: str, out: Path | None = None) -> Summary:
     """What `fieldcal fleet replay` says of one recording."""
-    (summary,) = results_of(found([str(place)]), settings, Here(), out, audit=False)
+    (summary,) = results_of(recordings_in([str(place)]), settings, Here(), out, audit=False)
     return summary
 
 
@@ -98,7 +98,7 @@ def test_one_bad_file_is_told_and_the_others_have_the_same_bits_with_one_and_two
 def test_dask_gives_the_same_bits(recordings: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra fleet is not installed")
     (tmp_path / "one").mkdir()
-    assert len(list(results_of(found([str(recordings)]), (), Here(), tmp_path / "one", audit=False))) == 4
+    assert len(list(results_of(recordings_in([str(recordings)]), (), Here(), tmp_path / "one", audit=False))) == 4
     # in a process of its own: Dask's threads and sockets would outlive this test
     script = (
         "import os, sys\nos.environ['OPENBLAS_NUM_THREADS'] = '1'\nfrom distributed import LocalCluster\n"
@@ -140,7 +140,7 @@ def test_a_killed_run_leaves_whole_results_and_no_process_and_goes_on(recordings
     before = {name: data for name, data in written(out).items() if name.endswith(".json")}
     assert 3 <= len(before) < 16
     wait_for(lambda: not any(_runs(pid) for pid in children))
-    after = list(results_of(found([str(many)]), (), Here(), out, audit=False))
+    after = list(results_of(recordings_in([str(many)]), (), Here(), out, audit=False))
     assert (sum(summary.unchanged for summary in after), len(after)) == (len(before), 16)
     assert not any(summary.reasons for summary in after)
     assert {name: written(out)[name] for name in before} == before
@@ -255,8 +255,8 @@ def test_what_names_no_recording_is_bad_usage(tmp_path: Path) -> None:
 
 def test_directories_patterns_and_files_name_each_recording_once(recordings: Path) -> None:
     three = [str(recordings / f"gateway-{seed}.mcap") for seed in (1, 2, 3)]
-    assert found([f"{recordings}/gateway-*.mcap", three[0]]) == three
-    assert found([three[2], str(recordings)]) == [three[2], str(recordings / "damaged.mcap"), *three[:2]]
+    assert recordings_in([f"{recordings}/gateway-*.mcap", three[0]]) == three
+    assert recordings_in([three[2], str(recordings)]) == [three[2], str(recordings / "damaged.mcap"), *three[:2]]
 
 
 @pytest.mark.parametrize(
@@ -265,7 +265,7 @@ def test_directories_patterns_and_files_name_each_recording_once(recordings: Pat
 )
 def test_an_address_with_credentials_is_refused_and_not_repeated(place: str) -> None:
     with pytest.raises(SourceError, match="environment") as refused:
-        found([place])
+        recordings_in([place])
     assert "SECRET" not in str(refused.value)
 
 
@@ -302,7 +302,7 @@ def test_recordings_in_an_object_store(recordings: Path, tmp_path: Path, monkeyp
     for name in ("gateway-1", "damaged"):
         store.put(str(recordings / f"{name}.mcap"), f"fleet/site/{name}.mcap")
     (tmp_path / "out").mkdir()
-    told = list(results_of(found(["s3://fleet/"]), (), Here(), tmp_path / "out", audit=False))
+    told = list(results_of(recordings_in(["s3://fleet/"]), (), Here(), tmp_path / "out", audit=False))
     assert [summary.place for summary in told] == ["s3://fleet/site/damaged.mcap", "s3://fleet/site/gateway-1.mcap"]
     local_one = json.loads(run_task(Task(place=str(recordings / "gateway-1.mcap"))))
     stored_one = json.loads(next((tmp_path / "out").glob("gateway-1*")).read_bytes())

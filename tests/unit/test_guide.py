@@ -11,7 +11,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from msgspec import structs
 
-from agent.bench.screen import BenchScreen
+from agent.bench.screen import BenchScreen, Person
 from agent.config.known_keys import WatchedKeys
 from agent.delivery import guide as guide_module
 from agent.delivery.guide import Ending, Expanded, Guide, MadeFile, TakenStop, Warned, read_guide, signature_of
@@ -119,12 +119,14 @@ def test_a_guide_from_the_future_does_not_hide_those_that_follow(monkeypatch: py
 
 def test_what_is_said_long_and_often_stays_within_the_message() -> None:
     shown: list[Guide] = []
-    screen = BenchScreen("mems", WantedUncertainty(), lambda _: None, lambda _: None, lambda _: None, shown.append)
+    screen = BenchScreen(
+        "mems", WantedUncertainty(), Person(lambda _: None, lambda _: None, lambda _: None), shown.append
+    )
     for _ in range(30):
         screen.warn("knocks " * 100)
         screen.ask("question " * 100)
     screen.took(["x" * 100] * 150, np.full(9, 1e-3))
-    screen.ended(None, 3)
+    screen.show_end(None, 3)
     read = read_guide(msgspec.json.encode(shown[-1]), b"", GATEWAY, None)
     assert read == shown[-1]
     assert len(read.warnings) == guide_module.LINES_MAX

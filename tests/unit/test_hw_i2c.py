@@ -82,6 +82,7 @@ Learn = Callable[[Bus, int], I2CDevice]
         (SMBUS_ONLY, False, 32),
         (Adapter("60", longest=60), True, 60),
         (Adapter("161", longest=161), True, 161),
+        (Adapter("9", longest=9), True, 9),  # one sample
     ],
 )
 def test_what_an_adapter_takes_is_found_out(learned: Learn, adapter: Adapter, joins: bool, longest: int) -> None:

@@ -52,6 +52,12 @@ def test_beside_the_lag_the_misfit_is_that_of_noise_alone() -> None:
         assert next_one > 100.0 * values  # the motion is 40 times the noise
 
 
+def test_two_equal_lowest_values_are_one_minimum_between_them() -> None:
+    at_s, depth = minima(1e-3 * np.arange(4.0), np.array([2.0, 1.0, 1.0, 2.0]))
+    np.testing.assert_allclose(at_s, [1.5e-3])
+    np.testing.assert_allclose(depth, [0.875])  # of the parabola through 2, 1, 1
+
+
 def test_of_one_frequency_each_period_is_a_minimum() -> None:
     at_s = found(0.02, 1, (9.999, 10.001))[:3, 0]
     np.testing.assert_allclose(np.sort(at_s), [-0.08, 0.02, 0.12], atol=1e-3)

@@ -320,6 +320,6 @@ def test_the_plan_is_kept(kept: Kept) -> None:
     for name, at in (("mems", (0.1, 0.2)), ("mems", (0.123456789, 0.75)), ("other", (0.0, 1.0)), ("other", None)):
         first.place(Position(f"site/gw/{name}", at))
     later = Plans(kept.engine, Access(None))
-    told = msgspec.json.decode(bytes(later.told(asked).body))
+    told = msgspec.json.decode(bytes(later.positions(asked).body))
     assert told["positions"] == {"site/gw/mems": [0.123456789, 0.75]}
     assert bytes(later.picture(asked).body) == b"another one"

@@ -173,7 +173,9 @@ def test_a_gateway_that_catches_up_needs_no_person() -> None:
     fleet.set_alive("site", "gw", True)
     whys = []
     for state in ("running", "catching up", "degraded"):
-        fleet.set_told("site", "gw", msgspec.json.encode({"state": state, "reasons": ["a reason"], "t_utc_ns": 1}))
+        fleet.set_gateway_status(
+            "site", "gw", msgspec.json.encode({"state": state, "reasons": ["a reason"], "t_utc_ns": 1})
+        )
         whys += [row["why"] for row in fleet.gateways({})]
     assert whys == ["", "", "degraded: a reason"]
 

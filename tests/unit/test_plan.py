@@ -54,6 +54,7 @@ def test_type_and_size_of_pictures() -> None:
         (png(640, 480)[:16] + b"\x00\x00\x10\x00" + png(640, 480)[20:], "damaged"),  # another width, the same CRC
         (png(0, 480), "no size"),
         (png(2**31 - 1, 1), "make it smaller"),
+        (png(2**24 + 640, 480), "make it smaller"),
         (png(10_000, 10_000), "make it smaller"),
         (jpeg(65_535, 65_535), "make it smaller"),
         (jpeg(640, 0), "no size"),  # T.81 lets a later DNL segment tell it

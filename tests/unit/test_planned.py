@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.bench.planned import more_stops, planned
+from agent.bench.planned import missing_stops, plan_of
 from agent.config import Channel, Config, parse_config
 from agent.core.estimation import Estimation
 from calib.model import Pose, Window
@@ -83,7 +83,7 @@ def test_what_is_planned_is_what_the_agent_reaches(name: str) -> None:
     """Which parameters are determined, whether a first calibration comes of it, and U once each was taken."""
     poses, more = SETS[name]
     channel = configured(poses, **more).channels[0]
-    plan, once, often = planned(channel, 1.0), taken(channel, 1), taken(channel, 6)
+    plan, once, often = plan_of(channel, 1.0), taken(channel, 1), taken(channel, 6)
     assert plan.enough == (often.gate.status == "VALID")
     first = np.sqrt(np.diag(Estimation(channel, 1.0).state.covariance()))
     last = np.sqrt(np.diag(often.state.covariance()))
@@ -103,7 +103,7 @@ def test_six_sides_by_a_closed_formula() -> None:
     held = [{"gravity_mps2": face} for face in faces]
     stated = {"offset_mps2": 0.05, "angle_deg": 0.0, "gravity_mps2": 0.0}
     config = configured([], positions=held, reference=None, uncertainty=stated)
-    plan = planned(config.channels[0], 1.0)
+    plan = plan_of(config.channels[0], 1.0)
     np.testing.assert_allclose(plan.expanded[[0, 4, 8]], 2.0 * 0.05 / (G * np.sqrt(2.0)), rtol=0.01)
     np.testing.assert_allclose(plan.expanded[9:], 2.0 * 0.05 / np.sqrt(6.0), rtol=0.01)
     assert plan.enough
@@ -117,15 +117,15 @@ def test_the_proposed_positions_are_enough_and_fewer_are_not() -> None:
         theta, alpha = random.uniform(20, 60), random.uniform(0, 180)
         poses = clamped((theta, alpha), (theta, alpha + random.uniform(40, 180)))
         channel = configured(poses).channels[0]
-        assert not planned(channel, 1.0).enough
-        more = more_stops(channel, 1.0)
-        assert planned(configured([*poses, *(stop.columns for stop in more)]).channels[0], 1.0).enough
-        assert not planned(configured([*poses, *(stop.columns for stop in more[:-1])]).channels[0], 1.0).enough
+        assert not plan_of(channel, 1.0).enough
+        more = missing_stops(channel, 1.0)
+        assert plan_of(configured([*poses, *(stop.columns for stop in more)]).channels[0], 1.0).enough
+        assert not plan_of(configured([*poses, *(stop.columns for stop in more[:-1])]).channels[0], 1.0).enough
 
 
 @pytest.mark.slow
 def test_a_day_of_poses_is_planned_soon() -> None:
     angles = [(35.0, float(k % 360)) for k in range(20_000)]
     began_s = time.process_time()
-    assert planned(configured(clamped(*angles)).channels[0], 1.0).enough
+    assert plan_of(configured(clamped(*angles)).channels[0], 1.0).enough
     assert time.process_time() - began_s < 10.0

@@ -170,6 +170,14 @@ def reference(path: Path, columns: str | None = None, sensitivity: str | None = 
     return read_reference(path, None, columns, sensitivity_of(sensitivity) if sensitivity else None)
 
 
+@pytest.mark.parametrize(
+    ("header", "stated"),
+    [("x [m/s2],y [m/s2],z [m/s2]", True), ("x,y [m/s2],z [m/s2]", False), ("x,y,z", False)],
+)
+def test_the_unit_is_stated_where_each_axis_has_one(header: str, stated: bool, tmp_path: Path) -> None:
+    assert reference(written(tmp_path, f"time_s,{header}\n" + table())).unit_stated is stated
+
+
 def test_three_axes_in_g(tmp_path: Path) -> None:
     found = reference(written(tmp_path, "Time,AccX [g],AccY [g],AccZ [g]\n" + table()))
     np.testing.assert_allclose(found.x[:], G * VALUES[:, 1:], rtol=1e-14)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,14 @@ def test_a_bomb_of_matlab_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (tmp_path / "a.mat").stat().st_size < 1e4
     monkeypatch.setattr(source, "ALWAYS_ALLOWED_BYTES", 1 << 20)  # so that the test needs no 300 MB
     fault(tmp_path / "a.mat", "the file says that it holds .* are allowed for its size")
+
+
+def test_a_bomb_beside_the_variables_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    savemat(tmp_path / "a.mat", {"x": np.zeros(3)})
+    packed = zlib.compress(bytes(4 << 20))  # an element that holds no variable
+    data = (tmp_path / "a.mat").read_bytes() + struct.pack("<II", 15, len(packed)) + packed
+    monkeypatch.setattr(source, "ALWAYS_ALLOWED_BYTES", 1 << 20)
+    fault(written(tmp_path, data, "b.mat"), "the file says that it holds .* are allowed for its size")
 
 
 def test_a_cell_array_that_announces_too_much_is_refused(tmp_path: Path) -> None:

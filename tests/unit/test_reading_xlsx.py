@@ -15,6 +15,7 @@ import pytest
 
 openpyxl = pytest.importorskip("openpyxl", reason="openpyxl is not installed")
 from agent.calibrate.tables import read_reference, read_sensor  # noqa: E402
+from agent.reading.dialect import dialect_of_cells  # noqa: E402
 from agent.reading.formats import open_source  # noqa: E402
 from agent.reading.source import TableError  # noqa: E402
 
@@ -141,3 +142,11 @@ def test_a_cut_file_and_another_archive(tmp_path: Path) -> None:
         archive.writestr("sensor.csv", "time_s,vx,vy,vz\n")
     with pytest.raises(TableError, match="not text, and of no format that is known"):
         read_sensor(tmp_path / "c.zip")
+
+
+def test_lines_above_the_names_of_the_columns_may_hold_values() -> None:
+    head = [["Serial", "12345", "100", ""], ["Range", "16", "2", ""], ["time", "x", "y", "z"]]
+    rows = [*head, *([f"{k / 100:.2f}", "1.5", "2.0", "3.0"] for k in range(6))]
+    dialect = dialect_of_cells(list(enumerate(rows, start=1)))
+    assert dialect is not None
+    assert (dialect.header, dialect.header_line, dialect.first_line) == (("time", "x", "y", "z"), 3, 4)

@@ -13,7 +13,7 @@ from agent.report.frequencies import over_frequency, response
 from agent.report.result import CalibrationResult, ResultError, from_update, parse
 from agent.report.timelines import SOURCES, variance_shares
 from agent.report.trace import PHASE_BINS, Trace, by_phase, residuals, spans, spectrum
-from agent.report.units import output_unit, said, sensitivity_unit
+from agent.report.units import in_words, output_unit, sensitivity_unit
 from calib.geometry import along, clamp
 from calib.model import PARAMETERS
 from calib.rounding import plus_minus
@@ -210,5 +210,5 @@ def test_shares_of_the_variance_are_whole_and_the_largest_are_named() -> None:
 def test_units_in_both_languages() -> None:
     assert (output_unit("m/s2"), sensitivity_unit("m/s2")) == ("m/s²", "1")
     assert (output_unit("mV"), sensitivity_unit("mV")) == ("mV", "mV/(m/s²)")
-    assert said("rate_hz") == "rate in Hz"
-    assert said("OFFSET_X_H") == "OFFSET_X_H"
+    assert in_words("rate_hz") == "rate in Hz"
+    assert in_words("OFFSET_X_H") == "OFFSET_X_H"

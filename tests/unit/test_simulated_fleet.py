@@ -26,7 +26,7 @@ from agent.config.known_keys import add_key
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange
 from agent.delivery.consumer import Consumer, Received
 from agent.fleet import simulated_processes
-from agent.fleet.simulated import ODD, SimulatedFleet, behaviours
+from agent.fleet.simulated import NEVER, ODD, FleetPlan, SimulatedFleet, SimulatedGateway, Stories, behaviours
 from agent.fleet.simulated_processes import FleetProcesses
 from agent.fleet.simulated_sensor import BEGINS, Behaviour, SimulatedSensor, Story
 from tests.unit.zenoh_site import Site, taken_until, wait_for
@@ -47,7 +47,7 @@ def consumer_of(site: Site, fleet: SimulatedFleet, directory: Path) -> Iterator[
 
 def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
     site = Site()
-    with SimulatedFleet(4, 1, 1, [site.endpoint], tmp_path) as fleet:
+    with SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet:
         assert fleet.names_of("hostile")
         assert fleet.step(T_NS) > 0
         site.kill()
@@ -57,7 +57,7 @@ def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_every_result_arrives_once_in_order_and_signed_and_forged_ones_are_refused(site: Site, tmp_path: Path) -> None:
     with (
-        SimulatedFleet(4, 1, 1, [site.endpoint], tmp_path) as fleet,
+        SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet,
         consumer_of(site, fleet, tmp_path) as consumer,
     ):
         assert not fleet.unconnected
@@ -97,6 +97,15 @@ SOUND = ["UNCALIBRATED", "VALID"]
 
 
 @cache
+def test_a_silent_gateway_makes_no_more_results(tmp_path: Path) -> None:
+    gateway = SimulatedGateway(FleetPlan(1, 1, 1, [], tmp_path), 0, "silent", Stories(1).sensors(0, "silent", 1))
+    made = [gateway.step(T_NS + k * DAY_NS, NEVER) for k in range(BEGINS["silent"] + 2)]
+    gateway.close()
+    assert min(made[:-2]) > 0
+    assert made[-2:] == [0, 0]
+    assert gateway.truth()["since_utc_ns"] == T_NS + BEGINS["silent"] * DAY_NS
+
+
 def told(behaviour: Behaviour) -> tuple[list[Result], dict[str, Any]]:
     """The results of a sensor, and the truth at the end. Its gateway's results have numbers from 1001 on."""
     other, sensor = (
@@ -234,8 +243,8 @@ def test_a_fleet_in_several_processes_is_the_same_fleet(
 ) -> None:
     monkeypatch.setattr(simulated_processes, "GATEWAYS_EACH", 2)
     with (
-        SimulatedFleet(3, 1, 7, [site.endpoint], tmp_path / "one") as one,
-        FleetProcesses(3, 1, 7, [site.endpoint], tmp_path / "many") as many,
+        SimulatedFleet(FleetPlan(3, 1, 7, [site.endpoint], tmp_path / "one")) as one,
+        FleetProcesses(FleetPlan(3, 1, 7, [site.endpoint], tmp_path / "many")) as many,
     ):
         assert len(set(many.pids())) == 2
         assert sorted((g.name, g.behaviour, g.public_key) for g in many.gateways) == [
@@ -253,7 +262,7 @@ def test_a_fleet_in_several_processes_is_the_same_fleet(
 @pytest.mark.slow
 def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: Path) -> None:
     with (
-        SimulatedFleet(5, 1, 1, [site.endpoint], tmp_path) as fleet,
+        SimulatedFleet(FleetPlan(5, 1, 1, [site.endpoint], tmp_path)) as fleet,
         consumer_of(site, fleet, tmp_path) as consumer,
     ):
         fleet.step(T_NS, 0.5)
@@ -269,7 +278,7 @@ def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: P
 
 @pytest.mark.slow
 def test_a_process_that_ends_is_told(site: Site, tmp_path: Path) -> None:
-    with FleetProcesses(2, 1, 1, [site.endpoint], tmp_path) as fleet:
+    with FleetProcesses(FleetPlan(2, 1, 1, [site.endpoint], tmp_path)) as fleet:
         os.kill(fleet.pids()[0], signal.SIGKILL)
         with pytest.raises(BrokenProcessPool):
             fleet.step(T_NS)

@@ -38,7 +38,7 @@ def test_a_sine_has_its_power_at_its_frequency_and_noise_its_variance() -> None:
     values = np.column_stack([2.0 * np.sin(2 * np.pi * 12.5 * t), noise, np.full(len(t), 9.81)])
     for k in range(0, len(t), 50):
         minute.add(block(values[k : k + 50], k))
-    told = json.loads(json.dumps(minute.told(), allow_nan=False))
+    told = json.loads(json.dumps(minute.as_object(), allow_nan=False))
     assert (told["seconds"], told["segments"], told["begun_anew"], told["segment_s"]) == (60.0, 11, 0, 10.0)
     hz, density = np.array(told["frequency_hz"]), np.array(told["density"])
     assert hz[np.argmax(density[0])] == 12.5
@@ -58,12 +58,12 @@ def test_lost_samples_begin_the_minute_anew_and_older_ones_go() -> None:
     minute, values = LastMinute(), np.zeros((50, 3))
     for k in range(200):
         minute.add(block(values, 50 * k))
-    assert minute.told()["seconds"] == 60.0
+    assert minute.as_object()["seconds"] == 60.0
     minute.add(block(values, 50 * 201))
-    told = minute.told()
+    told = minute.as_object()
     assert (told["seconds"], told["begun_anew"], told["segments"]) == (0.5, 1, 0)
     minute.add(block(values, 50 * 202, rate_hz=200.0))
-    assert minute.told()["begun_anew"] == 2
+    assert minute.as_object()["begun_anew"] == 2
 
 
 def test_a_block_that_cannot_be_computed_with_is_left_out() -> None:

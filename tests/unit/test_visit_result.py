@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from agent.bench.kinds import mounted
+from agent.bench.kinds import mounted_stop
 from agent.bench.measuring import StopInterval
 from agent.bench.visit_dialogue import Visited
 from agent.cli.visit import _result
@@ -29,7 +29,7 @@ def test_samples_that_calibrate_does_not_take_are_a_sensor_without_a_result(
     arguments = [f"--{name}={tmp_path / 's' / name}.csv" for name in ("sensor", "reference", "poses")]
     arguments.append(f"--json={tmp_path / 's' / 'result.json'}")
     told: list[str] = []
-    visited = Visited("measured", StopInterval(mounted(CHANNEL), 0.0, 60.0))
+    visited = Visited("measured", StopInterval(mounted_stop(CHANNEL), 0.0, 60.0))
     options = {"data_dir": tmp_path, "apart": True, "stated": None}
     result = _result(CHANNEL, visited, arguments, options, told.append)
     assert result["status"] == "refused"

@@ -36,12 +36,12 @@ def said(config: Config, device: str, indications: np.ndarray, unit: str = "coun
     info = DeviceInfo("serial-csv", "serial-csv", "1", unit, 3 if indications.shape[1] == 3 else 1, RATE_HZ)
     weighing, size = Weighing(config), round(RATE_HZ / 2)
     opened = DeviceChange(device=device, state="open", t_monotonic_ns=0, t_utc_ns=0, info_json=json.dumps(asdict(info)))
-    found = weighing.told(opened)
+    found = weighing.messages(opened)
     for first in range(0, len(indications), size):
         part = indications[first : first + size]
         at = np.array([first], dtype=np.int64)
         block = SampleBlock(device, "boot", 0, first, RATE_HZ, at, np.array([len(part)], dtype=np.int32), part)
-        found += weighing.told(block)
+        found += weighing.messages(block)
     return found
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agent.bench.planned import Planned, angles_deg, if_in_radians, more_stops, planned, states_positions
+from agent.bench.planned import Planned, angles_deg, if_in_radians, missing_stops, plan_of, states_positions
 from agent.bench.session import START
 from agent.bench.stops import GRAVITY, BenchStop
 from agent.config import Channel, Config
@@ -36,7 +36,7 @@ class ChannelPlan:
     watched: str = ""
 
     @property
-    def told(self) -> str:
+    def line(self) -> str:
         """The plan in a line, or that the sensor is watched; "" where there is neither."""
         if self.plan is None:
             return self.watched
@@ -88,12 +88,12 @@ def _plans(config: Config, options: Mapping[str, Options]) -> list[ChannelPlan]:
 
 def _plan_of(i: int, channel: Channel, nominal: float | None, config: Config) -> ChannelPlan:
     if channel.watched:
-        return ChannelPlan(channel.sensor, watched=_watched(channel))
+        return ChannelPlan(channel.sensor, watched=_watch_line(channel))
     if not states_positions(channel):
         told = channel.positions == "free" or _may_be_turned(config, channel)
         return ChannelPlan(channel.sensor, unplaced=() if told else (_no_position(i, channel),))
     try:
-        found = planned(channel, nominal)
+        found = plan_of(channel, nominal)
     except ValueError as error:
         return ChannelPlan(channel.sensor, faults=((("channels", i, "prior", "sensitivity"), str(error)),))
     if found.enough or _may_be_turned(config, channel):
@@ -109,7 +109,7 @@ def _plan_of(i: int, channel: Channel, nominal: float | None, config: Config) ->
     return ChannelPlan(channel.sensor, found, ((("channels", i, place), f"{what}; {_remedy(channel, nominal)}"),))
 
 
-def _watched(channel: Channel) -> str:
+def _watch_line(channel: Channel) -> str:
     dated = f"in force is that of {channel.prior.calibrated}, and its U grows from then on"
     undated = "in force is what an earlier run has kept; state that of a visit in prior.file and prior.calibrated"
     return f"{channel.sensor}: no reference: watched; {dated if channel.prior.calibrated else undated}"
@@ -132,17 +132,17 @@ def _may_be_turned(config: Config, channel: Channel) -> bool:
 def _remedy(channel: Channel, nominal: float | None) -> str:
     """What makes the plan enough."""
     in_degrees = if_in_radians(channel)
-    if in_degrees is not None and planned(in_degrees, nominal).enough:
+    if in_degrees is not None and plan_of(in_degrees, nominal).enough:
         angles = [f"theta_deg = {t:.4g}, alpha_deg = {a:.4g}" for t, a in angles_deg(in_degrees)]
         return f"the angles seem to be in radians; state degrees: {'; '.join(angles[:3])}{' ...' if angles[3:] else ''}"
     if any(one.direction is not None and one.gravity_mps2 is None for one in channel.poses):
         return "state gravity_mps2 beside each direction, or with gate.least_determined how many are enough"
-    if stops := more_stops(channel, nominal):
-        return f"add {' and '.join('{ ' + _as_stated(stop) + ' }' for stop in stops)}"
+    if stops := missing_stops(channel, nominal):
+        return f"add {' and '.join('{ ' + _position_text(stop) + ' }' for stop in stops)}"
     return "state with gate.least_determined how many are enough, or smaller uncertainties in prior"
 
 
-def _as_stated(stop: BenchStop) -> str:
+def _position_text(stop: BenchStop) -> str:
     """A position as the configuration states it, without times."""
     held = stop.columns
     if "theta_deg" in held:

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agent.config.reading import ConfigError
 from agent.terminal.text import for_drawing, say
 
 if TYPE_CHECKING:
@@ -16,11 +17,11 @@ if TYPE_CHECKING:
 OPEN_S = 20.0  # for the devices to be opened and to send their first block
 
 
-def opened(capture: Capture, devices: list[str]) -> dict[str, Any]:
+def wait_for_devices(capture: Capture, devices: list[str]) -> dict[str, Any]:
     """What the sensor's driver read of it, when all devices send. Raises ValueError where one does not."""
     end = time.monotonic() + OPEN_S
     while time.monotonic() < end:
-        for line in capture.said():
+        for line in capture.messages():
             say(line, err=True)
         if all(capture.newest_s(device) is not None for device in devices):
             return dict(capture.info(devices[0]) or {})
@@ -40,7 +41,7 @@ def with_filters(channel: Channel, capture: Capture) -> Channel:
     return filters.channel
 
 
-def parsed(arguments: list[str]) -> dict[str, Any]:
+def calibrate_options(arguments: list[str]) -> dict[str, Any]:
     """The options of `fieldcal calibrate` by these arguments."""
     from agent.cli.calibrate import calibrate
 
@@ -56,16 +57,29 @@ def check_stated(path: Path) -> None:
     load_model(path, CertificateStatements)
 
 
-def made(options: dict[str, Any], output: Path, stated: Path | None) -> int:
+def make_result(options: dict[str, Any], output: Path, stated: Path | None) -> int:
     """Make the result from the files as `fieldcal calibrate` does, and the certificate."""
     from agent.cli.calibrate import calibrate
-    from agent.cli.certificate import make
+    from agent.cli.certificate import CertificateOptions, make
 
     assert calibrate.callback is not None
     status = int(calibrate.callback(**options))
     if status or stated is None:
         return status
-    return make((output / "result.json",), output / "certificate", stated=stated)
+    return make((output / "result.json",), output / "certificate", CertificateOptions(stated=stated))
+
+
+def say_fault(error: Exception, command: str, directory: Path, option: str) -> None:
+    """Say what is wrong with the input. `directory`: of the results, which the `option` names; it must be new."""
+    if isinstance(error, ConfigError):
+        for fault in error.faults:
+            say(fault, err=True)
+    elif isinstance(error, FileExistsError):
+        say(f"fieldcal {command}: {directory} exists; name a new directory with {option}", err=True)
+    elif isinstance(error, OSError):
+        say(f"fieldcal {command}: {error.filename or directory}: {error.strerror}", err=True)
+    else:
+        say(f"fieldcal {command}: {error}", err=True)
 
 
 def ask(prompt: str, *, err: bool = False) -> str | None:
