@@ -163,7 +163,7 @@ def test_a_wild_window_among_the_held_ones_does_not_stand_in_the_way() -> None:
 
 
 @pytest.mark.parametrize(
-    "held", [pytest.param(5, marks=pytest.mark.slow), pytest.param(30, marks=pytest.mark.thorough)]
+    "held", [pytest.param(5, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.thorough)]
 )
 def test_a_reference_wrong_by_more_than_max_change_is_held_and_proposed_and_ends_when_it_ends(held: int) -> None:
     random = np.random.default_rng(6)
