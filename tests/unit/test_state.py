@@ -259,7 +259,7 @@ def test_the_innovation_is_chi_squared_and_each_score_normal() -> None:
     # 180 of them: the mean's SD is 0.48; segments of one window know their own scatter to a few per cent.
     assert 0.9 * freedom < np.mean(statistics) < 1.12 * freedom
     assert np.all(np.abs(np.mean(scores, axis=0)) < 4 / np.sqrt(n))
-    np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.2)
+    np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.17)  # a variance of 1.5 is seen
 
 
 def test_a_change_moves_a_score_by_what_the_information_says() -> None:
