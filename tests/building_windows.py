@@ -10,6 +10,9 @@ from tests.clamp_windows import G_MPS2, Q_TRUE, S_TRUE, sums_of
 GRAVITY = np.array([0.0, 0.0, G_MPS2])
 BESIDE = Pose("beside", np.eye(3), GRAVITY)
 RATE_HZ, SECONDS, SEGMENTS = 50.0, 60, 60
+OMEGA = 2 * np.pi * np.array([0.7, 1.3, 2.1, 3.7, 6.1])
+TURNED = np.outer(np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ, OMEGA)
+WAVES = np.hstack([np.sin(TURNED), np.cos(TURNED)])
 
 
 def building_window(
@@ -28,15 +31,11 @@ def building_window(
 
     `direction` (3,): what would go along y goes that way, and nothing else.
     """
-    t = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
-    a, da = np.zeros((len(t), 3)), np.zeros((len(t), 3))
-    for k, level in enumerate(level_mps2):
-        for f in (0.7, 1.3, 2.1, 3.7, 6.1):
-            phase = random.uniform(0, 2 * np.pi)
-            a[:, k] += level * np.sqrt(0.4) * np.sin(2 * np.pi * f * t + phase)
-            da[:, k] += level * np.sqrt(0.4) * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase)
+    phase = random.uniform(0, 2 * np.pi, (3, len(OMEGA))).T
+    cos, sin = (np.sqrt(0.4) * np.array(level_mps2) * x for x in (np.cos(phase), np.sin(phase)))
+    a, da = WAVES @ np.vstack([cos, sin]), WAVES @ np.vstack([-OMEGA[:, None] * sin, OMEGA[:, None] * cos])
     if direction is not None:
         a, da = (np.outer(x[:, 1], direction) for x in (a, da))
     V = (a + gravity_mps2) @ S.T + Q + noise_mps2 * random.normal(size=a.shape)
     u = a * (1.0 + reference_error) + reference_noise_mps2 * random.normal(size=a.shape)
-    return Window(0.0, SECONDS, BESIDE, sums_of(u, da, V, SEGMENTS), True, "", len(t), 0)
+    return Window(0.0, SECONDS, BESIDE, sums_of(u, da, V, SEGMENTS), True, "", len(a), 0)

@@ -9,25 +9,22 @@ from __future__ import annotations
 import pytest
 
 from hw.conformance.i2c import I2cContract
-from hw.virtual.kernel import PLAIN, SMBUS_ONLY
+from hw.virtual.kernel import PLAIN
 from hw.virtual.spi_bus import SPI
 
-AT_ONCE = (PLAIN, SPI)
-FOR_EACH_CHIP = (*AT_ONCE, SMBUS_ONLY)
+FOR_EACH_CHIP = (PLAIN, SPI)
 ON_ALL = "TestAdxl355"
-ACCESSES_AT_ONCE, ACCESSES_FOR_EACH_CHIP = 4, 12  # of `what_another_program`
+ACCESSES = 4  # of `what_another_program`
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """`make test-quick` has two kinds of adapter, `make test` three for each chip and all for one; likewise with the
-    accesses of other programs."""
+    """`make test-quick` has two kinds of adapter and few accesses of other programs, `make test` the others for one
+    chip, `make test-all` for each."""
     for item in items:
         if not isinstance(item, pytest.Function) or item.cls is None or not issubclass(item.cls, I2cContract):
             continue
         adapter = item.callspec.params["adapter"]
         access = int(str(item.callspec.params["seed"])) if "what_another_program" in item.name else 0
-        if adapter not in AT_ONCE or access >= ACCESSES_AT_ONCE:
-            item.add_marker("slow")
-        if item.cls.__name__ != ON_ALL and (adapter not in FOR_EACH_CHIP or access >= ACCESSES_FOR_EACH_CHIP):
-            item.add_marker("thorough")
+        if adapter not in FOR_EACH_CHIP or access >= ACCESSES:
+            item.add_marker("slow" if item.cls.__name__ == ON_ALL else "thorough")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from hw.block import BlockFlags, SampleBlock
 SECOND = 1_000_000_000
 EPOCH_NS = 1_790_000_000 * SECOND
 CONFIG = '{"window_blocks": 3}'
+here = cache(fingerprint)  # it takes 15 ms where many libraries are loaded
 Recorded = tuple[int, Event, list[Result]]
 
 
@@ -165,7 +167,7 @@ def run_start(pipeline: StandIn, event_sequence: int, file_sequence: int, now_ns
         t_utc_ns=EPOCH_NS + now_ns,
         config_json=pipeline.config_json,
         versions={"fieldcal": __version__},
-        fingerprint=fingerprint(),
+        fingerprint=here(),
         snapshot=pipeline.snapshot(),
         file_sequence=file_sequence,
         event_sequence=event_sequence,

@@ -21,7 +21,7 @@ from agent.recording.fingerprint import fingerprint
 from agent.recording.messages import encode
 from agent.recording.records import walk
 from agent.recording.writer import Recorder
-from tests.replay.stand_in import CONFIG, SECOND, Recorded, StandIn, happenings, record_run, run_start
+from tests.replay.stand_in import CONFIG, SECOND, Recorded, StandIn, happenings, here, record_run, run_start
 
 BLOCKS = 14
 ROTATIONS = (9, 20, 22)
@@ -32,7 +32,7 @@ def files_of(directory: Path) -> list[Path]:
 
 
 def replayed(files: list[Path], restore: Callable[[str, bytes], StandIn] = StandIn.restore) -> list[Replayed]:
-    replayer = Replayer(Engines(restore), fingerprint(), elsewhere=0.0)
+    replayer = Replayer(Engines(restore), here(), elsewhere=0.0)
     found = [replayer.run(path) for path in files]
     link(found)
     return found

@@ -10,7 +10,8 @@ import pytest
 from benchmarks.online.agreement import LIMIT_U, Both, bench_day, building
 
 
-@pytest.mark.parametrize(("recording", "seed"), [(bench_day, 2), (bench_day, 3), (building, 3), (building, 5)])
+@pytest.mark.parametrize("recording", [bench_day, building])
+@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.thorough)])
 def test_files_and_agent_agree(recording: Callable[[int], Both], seed: int) -> None:
     both = recording(seed)
     # A hole in one visit may cut it for the agent, which sees blocks, and not for the file, which sees stamps.

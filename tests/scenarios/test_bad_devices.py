@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from agent.acquisition.service import Service
+from agent.cli.main import run_cli
 from agent.config import parse_config
 from agent.core.events import DeviceChange, Gap
 from agent.recording.reading import RecordingReader
@@ -21,7 +22,7 @@ from hw.block import SampleBlock
 from hw.virtual.adxl355_twin import Adxl355Twin
 from hw.virtual.kernel import I2CBus, installed
 from hw.virtual.serial_port import PtyDevice
-from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
+from tests.scenarios.processes import interrupt, recordings, results, started, wait_until
 
 CONFIG = """
 [gateway]
@@ -180,16 +181,18 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "named"), FAULTS, ids=[named for _, _, named in FAULTS])
-def test_a_faulty_configuration_is_refused_with_path_and_value(tmp_path: Path, old: str, new: str, named: str) -> None:
+def test_a_faulty_configuration_is_refused_with_path_and_value(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], old: str, new: str, named: str
+) -> None:
     path = configuration(tmp_path, Path("/dev/ttyUSB0"))
     path.write_text(path.read_text().replace(old, new))
     commands: tuple[list[str | Path], ...] = (
         ["check", path], ["run", path, "--data-dir", tmp_path / "data", "--duration", "5"],
     )  # fmt: skip
     for command in commands:
-        done = fieldcal(*command)
-        assert done.returncode == 2, done.stdout
-        assert str(path) in done.stderr
-        assert named in done.stderr
-        assert "Traceback" not in done.stderr
+        assert run_cli([str(word) for word in command]) == 2
+        told = capfd.readouterr().err
+        assert str(path) in told
+        assert named in told
+        assert "Traceback" not in told
     assert not (tmp_path / "data").exists()

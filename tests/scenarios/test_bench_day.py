@@ -23,7 +23,8 @@ from hw.virtual.motion import sine
 SEED = 1
 
 
-@pytest.mark.parametrize("rate_hz", bench.RATES_HZ)
+@pytest.mark.one_case
+@pytest.mark.parametrize("rate_hz", sorted(bench.RATES_HZ))
 def test_s_and_q_are_those_of_fieldcal_calibrate_told_everything(rate_hz: float) -> None:
     day = bench.day(SEED, rate_hz)
     stops = [f"theta {theta_deg:g} deg, alpha {alpha_deg:g} deg" for theta_deg, alpha_deg in bench.STOPS]

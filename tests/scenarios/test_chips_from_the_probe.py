@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from hw.virtual import adxl355_twin, icm20948_twin, icm42688_twin, lis3dh_twin
+from hw.virtual import adxl355_twin, icm20948_twin
 from hw.virtual.bench import Bench
 from hw.virtual.fifo_twin import FifoTwin
 from hw.virtual.kernel import BCM2835, I2CBus
@@ -46,9 +46,7 @@ class Chip(NamedTuple):
 
 
 CHIPS = {
-    "lis3dh": Chip(lis3dh_twin.Lis3dhTwin, 0x19, 100.0, 500.0, 3e-3, lis3dh_twin.filters(100.0)),
     "icm20948": Chip(icm20948_twin.Icm20948Twin, 0x68, 112.5, 8192.0, 1.6e-3, icm20948_twin.filters(3)),
-    "icm42688": Chip(icm42688_twin.Icm42688Twin, 0x69, 100.0, 8192.0, 0.5e-3, icm42688_twin.filters(8)),
     # At this rate no FIFO of 32 samples overflows while a machine under load runs other processes.
     "adxl355": Chip(adxl355_twin.Adxl355Twin, None, 62.5, 128_000.0, 0.09e-3, adxl355_twin.filters(62.5)),
 }

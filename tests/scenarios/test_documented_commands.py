@@ -15,7 +15,7 @@ import pytest
 from tests.scenarios.processes import ROOT, interrupt, started, wait_until
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-FIRST = ("README.md", "start.md", "calibrate.md", "recording.md")  # in `make test`; the other pages in `make test-all`
+FIRST = ("README.md", "calibrate.md")  # in `make test`; the other pages in `make test-all`
 FENCE = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # Commands that run until they are stopped, each with a text in its first output.
 ENDLESS = {"run": "recording", "router": "tcp/", "simulate": "sensor "}

@@ -356,6 +356,7 @@ def test_names_on_the_plan_cover_no_other(site: Site, tmp_path: Path, browser: A
         watched.close()
 
 
+@pytest.mark.thorough
 def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:

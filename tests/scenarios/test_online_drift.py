@@ -10,9 +10,8 @@ from benchmarks.online.node import Timing
 TIMING = Timing(20.0, 12 * 3600.0, 120)  # 60 days, in which S_yy drifts by 1.6 %
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.thorough)])
-def test_a_drift_of_ten_percent_a_year_is_told_and_covered(seed: int) -> None:
-    run = drifting.one(drifting.SEED + seed, drifting.RATE_PCT, TIMING)
+def test_a_drift_of_ten_percent_a_year_is_told_and_covered() -> None:
+    run = drifting.one(drifting.SEED + 1, drifting.RATE_PCT, TIMING)
     assert {parameter for parameter, _ in run.found} == {"Syy"}
     assert len(run.errors) >= 115
     assert (run.beyond, run.held) == (0, 0)

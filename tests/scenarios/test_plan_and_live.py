@@ -49,6 +49,7 @@ def log_in(watched: Watched, name: str, view: str) -> Any:
     return page
 
 
+@pytest.mark.thorough
 def test_a_person_puts_sensors_on_the_plan(site: Site, tmp_path: Path, browser: Any) -> None:
     users = tmp_path / "users"
     set_user(users, "anna", ("plan",), PASSWORD)
@@ -101,6 +102,7 @@ def test_a_person_puts_sensors_on_the_plan(site: Site, tmp_path: Path, browser: 
         reader.close()
 
 
+@pytest.mark.thorough
 def test_the_signal_is_shown_with_its_spectrum_and_ends_when_nobody_looks(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:

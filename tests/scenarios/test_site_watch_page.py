@@ -29,7 +29,7 @@ def browser() -> Iterator[Any]:
 
 
 @needs_chromium
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_suspected_sensor_on_the_page(site: Site, tmp_path: Path, browser: Any) -> None:
     with Served(site, tmp_path / "monitor") as served:
         rows = lines()

@@ -67,6 +67,7 @@ def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> N
         },
         "test",
     )
+    gc.unfreeze()  # what tests/conftest.py froze
     assert len(gc.get_objects()) > 4 * FEW
     with RunView(config, "test", None) as watch:
         service = Service(config, tmp_path / "data", watch)

@@ -131,6 +131,7 @@ def test_probe_names_a_bus_that_is_not_there(site: UmockdevSite) -> None:
     assert "/dev/i2c-7 does not exist; state a bus" in out
 
 
+@pytest.mark.thorough
 def test_check_and_doctor_ask_the_devices(tmp_path: Path, site: UmockdevSite, bus: I2CBus, port: PtyDevice) -> None:
     config = configuration(tmp_path, port)
     out, _ = (process := program(site, "check", config)).communicate(timeout=30)

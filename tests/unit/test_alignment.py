@@ -138,7 +138,7 @@ APART = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reference", ["dc", "ac"])
+@pytest.mark.parametrize("reference", ["dc", pytest.param("ac", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize(("minutes", "to_hz", "ppm", "lag_s"), APART.values(), ids=APART)
 def test_clocks_that_run_apart_beside_a_lag(
     minutes: int, to_hz: float, ppm: float, lag_s: float, reference: str

@@ -48,7 +48,7 @@ def test_options_state_what_a_file_states(capsys: pytest.CaptureFixture[str], tm
     assert told(tmp_path / "again") == told(tmp_path / "file")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_option_replaces_what_the_file_states(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, result: Path
 ) -> None:
@@ -102,7 +102,7 @@ def test_a_wrong_entry_is_one_line(
     assert (status, said.count("\n"), words in said) == (2, 1, True), said
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_questions_are_asked_on_a_terminal(tmp_path: Path, result: Path) -> None:
     stated = [f"--state={name}={value}" for name, value in entries().items() if not name.startswith("customer")]
     answered("certificate", result, *stated, "-o", tmp_path / "out", typed="Tower Operator\nPescara\nIT\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from agent.config import Channel, parse_config
 from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import Estimation, Judged
 from agent.core.kept import keep, take_up
+from agent.core.snapshot import pack, unpack
 from tests.building_windows import GRAVITY, building_window
 from tests.clamp_windows import S_TRUE
 from tests.unit.test_check import GOOD
@@ -78,8 +80,17 @@ def actions(results: list[Judged]) -> list[str]:
     return [result.decision.action for result in results]
 
 
-def sound(found: Estimation, seed: int = 1) -> Estimation:
-    assert set(actions(judged(found, seed, 0, 12))) == {"take"}
+@cache
+def twelve_days(stability_pct: float) -> bytes:
+    """The state after twelve windows, in turn with both references."""
+    found = estimation(stability_pct)
+    assert set(actions(judged(found, 1, 0, 12))) == {"take"}
+    return pack(found.snapshot())
+
+
+def sound(stability_pct: float = 0.5) -> Estimation:
+    found = estimation(stability_pct)
+    found.load(unpack(twelve_days(stability_pct)))
     return found
 
 
@@ -90,7 +101,7 @@ def adopted(results: list[Judged]) -> str:
 
 
 def test_each_reference_has_its_own_unknowns_and_priors() -> None:
-    found = sound(estimation(stability_pct=0.0))
+    found = sound(0.0)
     for place, u in ((FIRST, 0.1), (SECOND, 0.2)):
         assert {f"lag of {'AB'[place]}", f"rotation_x of place {place}"} <= {q.key for q in found.state.quantities}
         (stated,) = [s for s in found.state.shares(place) if s.reference == "AB"[place]]
@@ -103,7 +114,7 @@ def test_each_reference_has_its_own_unknowns_and_priors() -> None:
 @pytest.mark.one_case
 @pytest.mark.parametrize(("which", "device", "other"), [("first", "r", "c"), ("second", "c", "r")])
 def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, device: str, other: str) -> None:
-    found, control = sound(estimation()), sound(estimation())
+    found, control = sound(), sound()
     judged(control, 101, 12, 24)
     before = found.in_force
     results = judged(found, 101, 12, 24, STEPPED[which])
@@ -120,13 +131,13 @@ def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, d
 
 @pytest.mark.thorough
 def test_a_reference_that_is_stated_not_to_drift_is_named_too() -> None:
-    results = judged(sound(estimation(stability_pct=0.0)), 101, 12, 24, STEPPED["first"])
+    results = judged(sound(0.0), 101, 12, 24, STEPPED["first"])
     assert "the reference r has changed by y +" in adopted(results)
 
 
 @pytest.mark.slow
 def test_if_both_see_the_step_it_is_the_sensor_and_u_does_not_grow() -> None:
-    found, control = sound(estimation()), sound(estimation())
+    found, control = sound(), sound()
     judged(control, 102, 12, 12)
     results = judged(found, 102, 12, 12, SENSOR)
     assert actions(results) == ["hold"] * 4 + ["adopt"] + ["take"] * 7
@@ -139,7 +150,7 @@ def test_if_both_see_the_step_it_is_the_sensor_and_u_does_not_grow() -> None:
 
 @pytest.mark.slow
 def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() -> None:
-    found = sound(estimation())
+    found = sound()
     before = found.in_force
     alone = judged(found, 103, 12, 5, STEPPED["first"], turns=(FIRST,) * 5)
     assert "no window with c tells whether the sensor or the reference r has changed" in adopted(alone)
@@ -152,7 +163,7 @@ def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() 
 
 @pytest.mark.slow
 def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
-    found = sound(estimation())
+    found = sound()
     assert actions(judged(found, 105, 12, 3, STEPPED["first"], turns=(FIRST,) * 3)) == ["hold"] * 3
     weak = building_window(np.random.default_rng(106), level_mps2=(0.0, 0.0, 0.1))  # nothing along y
     assert found.judge(weak, 15.0, 0.0, 20.0, place=SECOND).decision.action == "take"
@@ -162,7 +173,7 @@ def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
 
 @pytest.mark.slow
 def test_sound_windows_of_the_other_reference_do_not_dismiss_held_ones() -> None:
-    found = sound(estimation())
+    found = sound()
     turns = (FIRST, FIRST, SECOND, SECOND, SECOND, SECOND, FIRST, FIRST, FIRST)
     results = judged(found, 112, 12, len(turns), STEPPED["first"], turns=turns)
     assert actions(results) == ["hold"] * 2 + ["take"] * 4 + ["hold"] * 2 + ["adopt"]
@@ -176,7 +187,7 @@ def test_nothing_is_named_while_nothing_changes() -> None:
 
 @pytest.mark.slow
 def test_a_state_goes_on_bit_for_bit_while_windows_are_held() -> None:
-    found = sound(estimation())
+    found = sound()
     judged(found, 101, 12, 7, STEPPED["first"])
     assert found.gate.held
     again = estimation()
@@ -188,7 +199,7 @@ def test_a_state_goes_on_bit_for_bit_while_windows_are_held() -> None:
 
 
 def test_a_restarted_sensor_loosens_the_lag_behind_both_references() -> None:
-    found = sound(estimation())
+    found = sound()
     before = u_lags(found)
     found.began("c")
     assert u_lags(found)[0] == pytest.approx(before[0], rel=1e-9)
@@ -202,7 +213,7 @@ def u_lags(found: Estimation) -> list[float]:
 
 
 def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
-    found = sound(estimation())
+    found = sound()
     found.state.remount()
     for place in (FIRST, SECOND):
         assert found.state.quantity(f"rotation_x of place {place}")[1] >= np.deg2rad(0.2)
@@ -210,7 +221,7 @@ def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
 
 @pytest.mark.slow
 def test_a_second_reference_can_be_removed_and_added_again() -> None:
-    found = sound(estimation())
+    found = sound()
     both, alone = configured(), configured(both=False)
     single = take_up(keep(DriverFilters(both), "", found, None, None, 12.0, 0), DriverFilters(alone), None).estimation
     single.meet("A", "", 1.0)
@@ -227,7 +238,7 @@ def test_a_second_reference_can_be_removed_and_added_again() -> None:
 def test_a_changed_rotation_of_the_second_reference_loosens_the_mount() -> None:
     before, after = np.eye(3), np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     stated = [DriverFilters(configured(rotation=rotation.ravel().tolist())) for rotation in (before, after)]
-    turned = take_up(keep(stated[0], "", sound(estimation()), None, None, 12.0, 0), stated[1], None)
+    turned = take_up(keep(stated[0], "", sound(), None, None, 12.0, 0), stated[1], None)
     assert "check_rotation" in turned.reason
     assert turned.estimation.state.quantity("rotation_x of place 1")[1] > np.deg2rad(0.2)
 

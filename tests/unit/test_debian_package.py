@@ -77,7 +77,7 @@ def asked(*words: str | Path) -> str:
     return subprocess.run(["dpkg-deb", *words], capture_output=True, text=True, check=True).stdout
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_it_depends_on(package: Path) -> None:
     fields = dict(line.split(": ", 1) for line in asked("-f", package).splitlines() if line[:1] != " ")
     minor = subprocess.run(

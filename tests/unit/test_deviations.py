@@ -61,6 +61,7 @@ def test_a_narrow_feature_of_the_response_is_found_in_this_noise() -> None:
     assert 0.003 < found.relative_u < 0.03
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize("seed", range(4))
 def test_noise_as_strong_as_the_motion_is_no_other_response(seed: int) -> None:
     """The noise of a band is in its slopes: what they leave must not be multiplied by it. Over 60 such windows the

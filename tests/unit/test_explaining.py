@@ -95,6 +95,7 @@ def test_either_of_two_that_fit_alike_is_named() -> None:
     assert "another sensitivity (Syy +7" in told.reason
 
 
+@pytest.mark.thorough
 @pytest.mark.one_case
 @pytest.mark.parametrize(("response", "change"), [(lowpass(1, 25.0), "smaller"), (resonance(25.0, 10.0), "larger")])
 def test_another_filter_is_named_with_its_frequency(response: Filter, change: str) -> None:

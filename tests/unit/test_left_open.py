@@ -130,7 +130,7 @@ def test_the_part_of_axes_that_differ_is_that_of_a_corner() -> None:
 
 
 SEEDS = pytest.mark.parametrize(
-    "seeds", [pytest.param(6, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.thorough)]
+    "seeds", [pytest.param(6, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.thorough)]
 )
 
 
@@ -223,12 +223,11 @@ def test_corners_that_differ_explain_deviations_of_bands() -> None:
 
 
 @pytest.mark.thorough
-@SEEDS
-def test_deviations_that_axes_explain_do_not_count_twice(seeds: int) -> None:
+def test_deviations_that_axes_explain_do_not_count_twice() -> None:
     """Filters of order 4 near the motion: bands deviate by 0.1 %, S of an axis is off by a sixth of that, and u says
     so. Before, u without the reference's was 0.8 to 1.1e-3."""
     errors_, u_ = [], []
-    for seed in range(seeds):
+    for seed in range(8):
         random = np.random.default_rng([4, seed])
         own = [lowpass(4, hz) for hz in (1.5 * BAND_HZ[1] * (1.0 + 0.01 * random.normal(size=3))).tolist()]
         of, found = made(undisturbed, seed, lambda f, own=own: np.stack([h(f) for h in own]))  # type: ignore[misc]

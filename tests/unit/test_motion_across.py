@@ -111,6 +111,7 @@ def hours(transverse_pct: float) -> House:
     return house
 
 
+@pytest.mark.thorough
 def test_a_bridge_beside_a_vertical_reference_is_calm_where_its_motion_across_is_stated() -> None:
     gateway = hours(50.0).gateway
     update = gateway.in_force

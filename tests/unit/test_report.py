@@ -237,7 +237,7 @@ def test_a_result_of_files_is_shown_with_their_samples_as_long_as_they_are_the_s
     assert "poses.csv has changed since the calibration" in held["notices"][0]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write(tmp_path / "r.json", method="1")
     for name in ("a", "b"):

@@ -182,7 +182,7 @@ def test_u_covers_the_truth(behaviour: Behaviour) -> None:
     assert 2 * max(last.standard_uncertainty[:9]) < 0.05 * 26154
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_words_name_an_estimate_by_the_number_that_its_own_gateway_gave_it() -> None:
     results, _ = told("leaning")  # another gateway has the same story, and other numbers
     numbers = {r.sequence for r in results if isinstance(r, Estimate)}

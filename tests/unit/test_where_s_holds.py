@@ -208,7 +208,7 @@ def test_a_response_that_noise_makes_up_is_refused_with_a_remedy_that_works() ->
     assert np.all(away < found.expanded_uncertainty[:9])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_remedy_is_not_named_where_it_would_not_work() -> None:
     """A resonance within the motion is no flat filter."""
     made = pair(3, lambda f: 1.0 / (1.0 - (f / 4.0) ** 2 + 0.1j * f / 4.0))
