@@ -28,7 +28,7 @@ from benchmarks.page import machine, write_part
 from calib.estimate.nuisances import Priors
 from calib.model import Array
 from calib.recorded.adjusting import adjusted
-from calib.signal.known_response import UNKNOWN, known_of
+from calib.signal.known_response import UNKNOWN, known_response_of
 from calib.windows.deviations import U_CORNER
 from tests.pair import (
     NOTHING,
@@ -126,7 +126,10 @@ def one_known(job: tuple[str, float, bool, int]) -> tuple[Result, Result]:
     acts, error = filter_by(1.0 + U_KNOWN * random.normal()), U_REFERENCE * random.normal()
     response: Filter = (lambda f: 1.0 / acts(f)) if in_reference else acts
     found = []
-    for known in (known_of(["flat"], [line]) if in_reference else known_of([line], ["flat"]), UNKNOWN):
+    for known in (
+        known_response_of(["flat"], [line]) if in_reference else known_response_of([line], ["flat"]),
+        UNKNOWN,
+    ):
         made = pair(
             seed, response, band_hz=KNOWN_BAND_HZ, rate_hz=200.0, seconds=300.0, reference_error=error, known=known
         )
@@ -248,7 +251,10 @@ def one_inside(job: tuple[str, int, int]) -> tuple[str, float]:
     at_hz = Priors(reference=U_REFERENCE, reference_frequency_hz=made.reference_frequency_hz)
     outcome, told = adjusted(made.files, at_hz), "valid at once"
     if outcome.reasons and "`sensor_filter` flat" in outcome.reasons[-1]:
-        outcome, told = adjusted(made.files, at_hz.beside_known(known_of(["flat"], ["flat"]))), "with flat filters"
+        outcome, told = (
+            adjusted(made.files, at_hz.beside_known(known_response_of(["flat"], ["flat"]))),
+            "with flat filters",
+        )
     elif outcome.reasons:
         return "refused", 0.0
     elif outcome.more["band_hz"] is not None:

@@ -180,7 +180,7 @@ def driver_of(sensor: object) -> str:
     return f"{type(sensor).__module__}.{type(sensor).__qualname__}"
 
 
-def told_as(error: BaseException) -> str:
+def as_driver_fault(error: BaseException) -> str:
     """An exception that a driver raised; a promise that it broke tells itself."""
     return words(error) if isinstance(error, BadDriverError) else f"{type(error).__name__}: {words(error)}"
 

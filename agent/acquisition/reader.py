@@ -20,7 +20,7 @@ from agent.config.channel import SelfTestPlan
 from agent.config.devices import Device
 from agent.core.events import IN_DRIVER, DeviceChange, Event, Gap, SelfTestRun
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
-from hw.promises import BlockCheck, checked_drops, checked_info, driver_of, told_as, words
+from hw.promises import BlockCheck, as_driver_fault, checked_drops, checked_info, driver_of, words
 from hw.self_test import SelfTestingSensor
 from hw.sensor import AdapterError, ConfigurationError, DeviceError, DeviceLost, Sensor, load_driver, system_clock
 
@@ -198,7 +198,7 @@ class Reader(threading.Thread):
             return None if block is None else check.taken(block)
         except BaseException as error:
             if block is not None:
-                self._report_drop(1, "blocks", f"{IN_DRIVER}: {told_as(error)}")
+                self._report_drop(1, "blocks", f"{IN_DRIVER}: {as_driver_fault(error)}")
             raise
 
     def _within(self, method: Callable[..., T], **arguments: Any) -> T:
@@ -227,7 +227,7 @@ class Reader(threading.Thread):
         try:
             shown = shown_by(sensor, self._within, self._stop_request.is_set)
         except BaseException as error:
-            self._report_self_test("failed", motion_mps2=motion, message=told_as(error))
+            self._report_self_test("failed", motion_mps2=motion, message=as_driver_fault(error))
             raise
         if shown:
             self._report_self_test("done", motion_mps2=motion, **shown)
@@ -250,11 +250,12 @@ class Reader(threading.Thread):
     def _report_fault(self, error: BaseException) -> None:
         """Report a fault of the driver itself; from the FAULTS_TOLD-th in a row on nothing more is reported."""
         self._faults += 1
-        told = f"{IN_DRIVER} {self._driver}: {told_as(error)}"
+        told = f"{IN_DRIVER} {self._driver}: {as_driver_fault(error)}"
         if self._faults == FAULTS_TOLD:
             told = (
                 f"{IN_DRIVER} {self._driver}, {FAULTS_TOLD} times in a row. Use another version of the driver, and "
-                f"tell its author; the agent tries again every {BACK_OFF_S[1]:g} s. The last fault: {told_as(error)}"
+                f"tell its author; the agent tries again every {BACK_OFF_S[1]:g} s. The last fault: "
+                f"{as_driver_fault(error)}"
             )
         if self._faults <= FAULTS_TOLD:
             self._report_lost(told)
@@ -292,6 +293,6 @@ def reader_of(device: Device, events: EventQueue, plan: SelfTestPlan | None = No
             _log.warning("%s: %s", device.name, advice)
         sensor = factory(device.name, options)
     except (Exception, SystemExit) as error:
-        told = f"{device.name}: {IN_DRIVER} {device.driver!r}: it cannot be made: {told_as(error)}"
+        told = f"{device.name}: {IN_DRIVER} {device.driver!r}: it cannot be made: {as_driver_fault(error)}"
         raise ConfigurationError(told) from error
     return Reader(device.name, sensor, events, SelfTesting(plan) if plan is not None else None)

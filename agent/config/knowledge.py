@@ -345,18 +345,18 @@ class Knowledge(Section):
         c, s = self.certificate, self.prior
         return Instrument(
             c.quantity, c.sensitivity, c.noise_mps2, c.corner_hz, c.u_corner_hz, s.corner_hz, s.u_corner_hz,
-            known=self.known,
+            known=self.known_filters,
         )  # fmt: skip
 
     @property
-    def known(self) -> KnownResponse:
+    def known_filters(self) -> KnownResponse:
         """What is stated of the filters of both instruments."""
         sensor, reference = tuple(map(filter_of, self.prior.filters)), self.certificate.known_filters
         return KnownResponse(sensor or None, reference or None)
 
     def priors(self, *, fixed_mount: bool) -> Priors:
         """The nuisances' priors."""
-        return Priors(self._stated(AT_FIXED_MOUNT if fixed_mount else PRIORS)).beside_known(self.known)
+        return Priors(self._stated(AT_FIXED_MOUNT if fixed_mount else PRIORS)).beside_known(self.known_filters)
 
     def wander(self) -> Wander:
         """How fast things may change."""

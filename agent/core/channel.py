@@ -14,7 +14,7 @@ from agent.core.corrected import accelerations
 from agent.core.driver_filters import DriverFilters
 from agent.core.estimation import DAY_S, Estimation
 from agent.core.events import CalibrationUpdate, Command, DeviceChange, Estimate, Output, Result, SelfTestRun, Tick
-from agent.core.fault import told
+from agent.core.fault import description
 from agent.core.identity import device_of, identity_of, nominal_of
 from agent.core.kept import keep, kept_as, plain, restated, shelved, take_up, update_of
 from agent.core.mean_watch import MeanWatch
@@ -93,7 +93,7 @@ class ChannelState:
         self._streams.by_device[block.device].update(block)
         scale = 0.0 if self._estimation is None else self._estimation.state.scale
         wrong = self._streams.watch(block, scale, self._time.origin_utc_ns)
-        results: list[Output] = [self._told(what) for what in wrong]
+        results: list[Output] = [self._status_change(what) for what in wrong]
         if block.device == self.sensor and self._estimation is not None:
             if self._status == "INVALID":
                 self._estimation.gate.regain("")
@@ -125,7 +125,7 @@ class ChannelState:
         if change.state == "lost":
             if change.device != self.sensor:
                 reason = f"the reference {change.device} is lost, S and Q stay as they are: {change.message}"
-                return [self._told(reason)]
+                return [self._status_change(reason)]
             return self._lose(f"{self.sensor} is lost: {change.message}")
         if self._estimation is not None:
             self._estimation.began(change.device)
@@ -150,17 +150,17 @@ class ChannelState:
             return []
         self._time.update(command.t_monotonic_ns, command.t_utc_ns)
         if self._estimation is None:
-            return [self._told(f"{command.verb} refused: {self.sensor} has not been connected in this run")]
+            return [self._status_change(f"{command.verb} refused: {self.sensor} has not been connected in this run")]
         try:
             if command.verb == "pose":
                 return self._turn(commanded_pose(command, self._channel))
             said, earlier = answer(command, self._estimation, self.identity)
         except CommandError as error:
-            return [self._told(f"{command.verb} refused: {error}")]
+            return [self._status_change(f"{command.verb} refused: {error}")]
         if said.refused:
-            return [self._told(f"{command.verb} refused: {said.refused}")]
+            return [self._status_change(f"{command.verb} refused: {said.refused}")]
         results: list[Result] = [self._put_in_force(earlier)] if said.calibration is not None else []
-        return [*results, *(self._say_status(said.reason) or [self._told(said.reason)])]
+        return [*results, *(self._say_status(said.reason) or [self._status_change(said.reason)])]
 
     # --- time and identity
 
@@ -207,10 +207,12 @@ class ChannelState:
         before, now, not_certified = self._references.identify(device, info_json)
         results = self._hear_filters(device, json.loads(info_json))
         if not before or before == now:
-            return results + ([self._told(f"S and Q are not updated: {not_certified}")] if not_certified else [])
+            return results + (
+                [self._status_change(f"S and Q are not updated: {not_certified}")] if not_certified else []
+            )
         self._streams.forget(device)
         reason = not_certified or f"the reference is another device now: {now} instead of {before}"
-        return results + (self._say_status(reason) or [self._told(reason)])
+        return results + (self._say_status(reason) or [self._status_change(reason)])
 
     def _hear_filters(self, device: str, info: Mapping[str, Any]) -> list[Result]:
         """What the driver of a device that was opened states of its filters; other ones are another response."""
@@ -219,7 +221,7 @@ class ChannelState:
             self._streams.state(now)
             if self._estimation is not None:
                 self._estimation, told, changed = restated(self._estimation, before, now, self._nominal, told)
-        results = [self._told(told)] if told else []
+        results = [self._status_change(told)] if told else []
         return [*results, *([self._put_in_force()] if changed else []), *self._meet_references()]
 
     def _meet_references(self) -> list[Result]:
@@ -244,7 +246,7 @@ class ChannelState:
         if self._estimation is None:
             return []
         found = self._estimation.explain(self._first_day * DAY_S + self._time.now_s, self._time.utc_ns)
-        return [self._told(found)] if found else []
+        return [self._status_change(found)] if found else []
 
     def _say_status(self, reason: str) -> list[Result]:
         return [] if self._estimation is None else self._change(self._estimation.gate.status, reason)
@@ -255,14 +257,14 @@ class ChannelState:
         before, self._status = self._status, status
         return [status_change(self._source(), status, before, reason)]
 
-    def _told(self, reason: str) -> Result:
+    def _status_change(self, reason: str) -> Result:
         return status_change(self._source(), self._status or "UNCALIBRATED", self._status, reason)
 
     # --- windows
 
     def _turn(self, pose: Pose) -> list[Result]:
         self._streams.turn(self._time.now_s, pose)
-        return [self._told(f"an operator set the position: {pose.position}")]
+        return [self._status_change(f"an operator set the position: {pose.position}")]
 
     def _close_windows(self) -> Iterator[Result]:
         """The results of all windows that are due. After a fault of the program its window is reported and not used."""
@@ -278,7 +280,7 @@ class ChannelState:
             except MemoryError:
                 raise  # not caused by the data: a replay would not repeat it
             except Exception as error:
-                fault = told(error)
+                fault = description(error)
                 reason = f"a fault of the program, not of the data; please report it: {fault}"
                 yield from self._refuse(refused(piece, reason), reason, fault)
 
@@ -288,7 +290,7 @@ class ChannelState:
         yield window_report(self._source(), window, used=False, reason=reason, numbers={}, fault=fault)
         self._refused += 1
         if fault or self._refused == REFUSED_IN_A_ROW:
-            yield self._told(f"S and Q are not updated: {reason}")
+            yield self._status_change(f"S and Q are not updated: {reason}")
 
     def _results(self, verdict: JudgedWindow, place: int = FIRST) -> Iterator[Result]:
         """The results of a window beside the reference at a place."""
@@ -302,7 +304,7 @@ class ChannelState:
         numbers = {**decision.numbers, "lag_applied_s": verdict.lag_s}
         yield window_report(source, window, used=used, reason="" if used else decision.reason, numbers=numbers)
         if judged.news:
-            yield self._told(judged.news)
+            yield self._status_change(judged.news)
         origin_utc_ns = self._time.utc_ns - round((self._first_day * DAY_S + self._time.now_s) * 1e9)
         for drift in judged.drift:
             yield drift_report(source, drift, self._channel.drift.false_alarms_a_year, origin_utc_ns)

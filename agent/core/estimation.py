@@ -20,7 +20,7 @@ from agent.core.noise_watch import NoiseWatch
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import StretchWindows
 from calib.drift.drift import DriftTest, DriftVerdict
-from calib.estimate.axes import LEAST_S, where_nothing_moved
+from calib.estimate.axes import LEAST_S, silent_directions
 from calib.estimate.correction import Law
 from calib.estimate.estimate import Estimate
 from calib.estimate.innovation import Innovation
@@ -235,7 +235,7 @@ class Estimation:
         return Evidence(
             day * DAY_S, tried.innovation.statistic, tried.innovation.degrees_of_freedom, dismisses=same,
             enough=tried.after.windows > 1 or window.stop_s - window.start_s >= LEAST_S,
-            still="" if self.gate.calibrated else where_nothing_moved(tried.after.unexcited),
+            still="" if self.gate.calibrated else silent_directions(tried.after.unexcited),
         )  # fmt: skip
 
     def _jump(self, held: Sequence[Record], place: int) -> Jump:

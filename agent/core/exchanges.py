@@ -76,7 +76,7 @@ class Exchange:
             return _of_other_outputs(record, back, np.zeros(3))
         return _of_other_outputs(record, np.asarray(S @ back @ np.linalg.inv(S)), Q)
 
-    def told(self, channel: Channel) -> str:
+    def sentence(self, channel: Channel) -> str:
         """In words, with the cause."""
         device, factor = self.device(channel), self.factor
         if factor is not None:
@@ -148,7 +148,7 @@ def _alike(said: Mapping[Exchange, Sequence[float]], most: Sequence[float], as_i
 def explanation(found: Explained, channel: Channel, since: str, held: int, number: int | None) -> str:
     """The explanation of so many held windows for an operator. `since`: the time of the change. `number` of the
     estimate that puts the change in force; None if there is none."""
-    first, *others = [cause.told(channel) for cause in found.causes[:MOST_TOLD]]
+    first, *others = [cause.sentence(channel) for cause in found.causes[:MOST_TOLD]]
     if (more := len(found.causes) - MOST_TOLD) > 0:
         others.append(f"{more} more")
     alike = f" As well fits: {'; '.join(others)}." if others else ""

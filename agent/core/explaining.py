@@ -88,10 +88,10 @@ def explained(
     fits = "Best fits" if best.chi2 <= sound else "Nearest, though not within what chance allows, is"
     # Of another filter, only windows tell all that were made for it.
     helps = best.chi2 <= sound or best.most.kind is RESPONSE
-    others = [_told(e, state.scale) for e in alike if e is not best and not best.members < e.members]
+    others = [_sentence(e, state.scale) for e in alike if e is not best and not best.members < e.members]
     as_well = f" As well fits: {'; '.join(others)}." if others else ""
     return (
-        f"{said} {fits} {_told(best, state.scale)}: chi-squared {best.chi2:.0f}.{as_well} "
+        f"{said} {fits} {_sentence(best, state.scale)}: chi-squared {best.chi2:.0f}.{as_well} "
         f"{_remedy(best, state.scale, channel, number) if helps else best.unfit or COMPARE}"
     )
 
@@ -183,7 +183,7 @@ def _moved(before: State, after: State, quantity: Quantity) -> tuple[float, floa
     return value - before.quantity(quantity.key)[0], max(u, np.finfo(float).tiny)
 
 
-def _told(explanation: Explanation, scale: float) -> str:
+def _sentence(explanation: Explanation, scale: float) -> str:
     kind, change = explanation.most.kind, explanation.change
     if kind is RESPONSE:  # by how much, only windows tell that were made for the new response
         return f"another {explanation.line} (S is {'larger' if change > 0.0 else 'smaller'} there)"

@@ -9,7 +9,7 @@ LONGEST = 200  # characters of the exception's message
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")  # address of an object in memory: it differs between processes
 
 
-def told(error: Exception) -> str:
+def description(error: Exception) -> str:
     """`ValueError at agent/core/windows.py:57: what it says`: the innermost line that belongs to this program."""
     place, trace = "an unknown place", error.__traceback__
     while trace is not None:

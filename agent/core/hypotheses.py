@@ -163,11 +163,11 @@ def _tried(
 ) -> TriedStep:
     after = state.after(held, u)
     grown = after.chi2 - before
-    fits = grown <= limit(sum(record.rows for record in held)) and not _made_otherwise(state, after, held, place)
+    fits = grown <= limit(sum(record.rows for record in held)) and not _differs_in_making(state, after, held, place)
     return TriedStep(after, grown, len(u), fits)
 
 
-def _made_otherwise(before: State, after: State, held: Sequence[Record], place: int) -> bool:
+def _differs_in_making(before: State, after: State, held: Sequence[Record], place: int) -> bool:
     """Whether the held windows were made with another filter or lag taken out than is right: they tell no exact S."""
     lag_s = after.lag_s(place)
     phase_rad = max(abs(lag_s - record.lag_s) * float(np.sqrt(record.omega2)) for record in held)

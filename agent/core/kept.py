@@ -113,7 +113,7 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> KeptE
         state = unpack(kept)
         in_force, day, t_utc_ns = update_of(state["in_force"]), float(state["day"]), int(state["t_utc_ns"])
     except MALFORMED as error:
-        reason = f"begun again from the prior: the stored state cannot be read: {_said(error)}"
+        reason = f"begun again from the prior: the stored state cannot be read: {_words(error)}"
         return KeptEstimation(Estimation(filters.channel, nominal), None, 0.0, 0, reason)
     if "estimation" not in state:
         return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, "nothing else was left")
@@ -128,7 +128,7 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> KeptE
         changed = _changed(state["basis"], configured)
         if configured.watched:
             return _kept_without_reference(state, fresh, in_force, were.channel, filters.channel, day, t_utc_ns)
-        if wrong := _made_otherwise(changed, state["basis"], configured):
+        if wrong := _changed_settings(changed, state["basis"], configured):
             reason = f"begun again from the prior: windows were made with other settings: {', '.join(wrong)}"
             return KeptEstimation(fresh, None, day, t_utc_ns, reason)
         stated = fresh.state.result()
@@ -141,7 +141,7 @@ def take_up(kept: bytes, filters: DriverFilters, nominal: float | None) -> KeptE
         kept_state = fresh.state.copy()
         moved = fresh.restate(gravity, remounted=bool(MOUNT & changed), size=size)
     except MALFORMED as error:
-        why = f"the stored state cannot be read: {_said(error)}"
+        why = f"the stored state cannot be read: {_words(error)}"
         return _from_in_force(state, in_force, filters.channel, nominal, day, t_utc_ns, why)
     reason = "restored from the previous run"
     if changed:
@@ -246,7 +246,7 @@ def _basis(channel: Channel) -> dict[str, str]:
     return {name: msgspec.json.encode(value, order="deterministic").decode() for name, value in whole.items()}
 
 
-def _made_otherwise(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> list[str]:
+def _changed_settings(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> list[str]:
     """Changed settings by which windows are made, or that give S another meaning: what was known tells nothing now."""
     found = sorted(WINDOWS.intersection(changed))
     frequency_hz = msgspec.json.decode(before["prior"]).get("reference_frequency_hz", 0.0)
@@ -291,7 +291,7 @@ def _known_size(channel: Channel, frequency_hz: float) -> float:
     """S at a frequency contains the sensor's known filters. Corners are undone: that of a reference makes S smaller."""
     corners_hz = (channel.certificate.corner_hz, channel.prior.corner_hz)
     reference, sensor = (np.hypot(1.0, corner_hz / frequency_hz) if frequency_hz else 1.0 for corner_hz in corners_hz)
-    return channel.known.sensor_size(frequency_hz) * float(sensor / reference)
+    return channel.known_filters.sensor_size(frequency_hz) * float(sensor / reference)
 
 
 def _gravity(changed: Iterable[str], before: Mapping[str, str], channel: Channel) -> tuple[float, float] | None:
@@ -340,5 +340,5 @@ def _same_mount(name: str, before: dict[str, str], now: dict[str, str]) -> bool:
     return bool(stayed) and all(were[position] == are[position] for position in stayed)
 
 
-def _said(error: Exception) -> str:
+def _words(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__

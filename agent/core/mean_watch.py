@@ -45,7 +45,7 @@ class MeanWatch:
         covariance: Array = np.cov(self._first[:, :3].T) * ALIKE * (1.0 / WEEK + 1.0 / DAY)
         covariance = covariance + between(law, before[3], now[3], before[:3])
         found = mean_change(now[:3] - before[:3], covariance, before[:3], law.mean[:9].reshape(3, 3))
-        return "" if found is None else found.told
+        return "" if found is None else found.sentence
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""

@@ -84,7 +84,7 @@ class NoiseWatch:
         known = self._of.pop(record.reference, None) or NoiseHistory()
         self._of = dict([*self._of.items(), (record.reference, known)][-MOST_REFERENCES:])
         changed = known.update(float(np.log(motion)), np.log(density))
-        return "; ".join(_told(AXES[k], density[k] / scale, float(np.exp(more))) for k, more in changed)
+        return "; ".join(_sentence(AXES[k], density[k] / scale, float(np.exp(more))) for k, more in changed)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""
@@ -97,7 +97,7 @@ class NoiseWatch:
         }
 
 
-def _told(axis: str, noise_mps2: float, times: float) -> str:
+def _sentence(axis: str, noise_mps2: float, times: float) -> str:
     if times == 1.0:
         return f"the noise of output {axis} is as it was before: {noise_mps2:.3g} m/s2"
     return (

@@ -75,7 +75,7 @@ def calibration_update(
         offset_temperature=[value for value, _ in by_power], u_offset_temperature=[u for _, u in by_power],
         sensitivity_per_k=[value for value, _ in by_row], u_sensitivity_per_k=[u for _, u in by_row],
         offset_rate=rate, u_offset_rate=u_rate, references=[name for name in state.references if name],
-        reference_frequency_hz=state.reference_frequency_hz, **_over_frequency(state.response_told(place)),
+        reference_frequency_hz=state.reference_frequency_hz, **_over_frequency(state.response_over_frequency(place)),
         shared_errors=_shared_errors(shares, certificate_of),
     )  # fmt: skip
 
@@ -95,7 +95,7 @@ def _shared_errors(
     for share in shares:
         certificate = certificate_of(share.reference)
         told = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
-        found.append(SharedError(**share.told(*told)))
+        found.append(SharedError(**share.as_object(*told)))
     return found
 
 

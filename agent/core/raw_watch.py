@@ -77,7 +77,7 @@ class RawWatch:
         for held in outputs.held(expected):
             if held.axis not in known:
                 start_s = float(np.clip(np.nan_to_num(stream.taken_at(held.first)[0], nan=now_s), 0.0, now_s))
-                said = f"{block.device}: {_what(held, block)} since {_utc(origin_utc_ns, start_s)}"
+                said = f"{block.device}: {_description(held, block)} since {_utc(origin_utc_ns, start_s)}"
                 faults.append(OutputFault(said, start_s, np.inf, held))
                 told += self._once(block.device, f"held {held.axis}", said, now_s)
         if outputs.repeats > repeats:
@@ -176,7 +176,7 @@ def _axis(axis: int, of: int) -> str:
     return AXES[axis] if of == len(AXES) else "its output"
 
 
-def _what(held: StuckOutput, block: SampleBlock) -> str:
+def _description(held: StuckOutput, block: SampleBlock) -> str:
     """In words, with the values as the device gives them."""
     name, low, high = _axis(held.axis, block.indications.shape[1]), f"{held.low:.10g}", f"{held.high:.10g}"
     if held.low != held.high:

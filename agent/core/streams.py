@@ -46,7 +46,7 @@ RESPONSE_TURNS = 6  # the first windows begin with no response
 MOST_DUE = 100  # pieces between two events; a tick comes each second, a window has 1 s, and samples are 60 s late
 
 
-def told_in(window: Window, missing: Mapping[str, float]) -> Window:
+def completed(window: Window, missing: Mapping[str, float]) -> Window:
     """The window with what is missing in its numbers."""
     return replace(window, numbers={**window.numbers, **missing}) if missing else window
 
@@ -186,7 +186,7 @@ class Streams:
             piece = replace(piece, pose=pose_beside(beside.rotation, beside))
         for part in self._parts(piece, first_s):
             for verdict in self._of_part(part, first_s, first_day, estimation, unusable):
-                yield replace(verdict, window=told_in(verdict.window, missing))
+                yield replace(verdict, window=completed(verdict.window, missing))
 
     def _parts(self, piece: PosePiece, first_s: float) -> list[PosePiece]:
         """What lies between the breaks of both devices; the whole piece where no part of it is long enough."""
@@ -227,8 +227,8 @@ class Streams:
             if placed.pose is None or unusable:
                 found = StretchWindows([refused(piece, unusable or placed.reason)])
             else:
-                found, lag_s, anew = self._found(replace(piece, pose=placed.pose), first_s, day, estimation)
-        found = found.told(placed.numbers)
+                found, lag_s, anew = self._windows(replace(piece, pose=placed.pose), first_s, day, estimation)
+        found = found.with_numbers(placed.numbers)
         for window in found.windows:
             judged = None
             if window.used and estimation is not None:
@@ -306,7 +306,7 @@ class Streams:
         cut = self._sensor.cut(first_s + piece.start_s, first_s + piece.stop_s)
         return self._finder.place(piece, cut, estimation.state, day)
 
-    def _found(
+    def _windows(
         self, piece: PosePiece, first_s: float, day: float, estimation: Estimation | None
     ) -> tuple[StretchWindows, float, Anew | None]:
         """The windows, made again until neither a lag nor a response is left in them that matters; what a search for
@@ -359,7 +359,7 @@ class Streams:
             if within.used and not estimation.contradicted(within, day, lag_s, self.place):
                 time_s = samples.points.time_s
                 count = np.count_nonzero((time_s < part_s[0]) | (time_s > part_s[1]))
-                return within.told({"misplaced_samples": float(count)}), lag_s, None
+                return within.with_numbers({"misplaced_samples": float(count)}), lag_s, None
         make = partial(self._make, piece, first_s, response, to_hz)
         anew = watch.search(state, make, found, lag_s, piece.pose, samples, day)
         if anew is not None and not anew.beyond:

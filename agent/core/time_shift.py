@@ -55,7 +55,7 @@ class LagChange:
     u_before_s: float
     devices: list[str]
 
-    def told(self, lag_s: float, u_lag_s: float, sensor: str, reference: str) -> str:
+    def news(self, lag_s: float, u_lag_s: float, sensor: str, reference: str) -> str:
         """The news of the change for the operator; "" if the lag is as before."""
         change_s = lag_s - self.before_s
         if abs(change_s) <= TOLD_FROM_U * float(np.hypot(self.u_before_s, u_lag_s)):
@@ -145,7 +145,7 @@ class LagWatch:
         if line is None or self._channel.reference is None:
             return ""
         lag = state.quantity("lag", self._place)
-        return line.told(*lag, self._channel.sensor, self._channel.reference)
+        return line.news(*lag, self._channel.sensor, self._channel.reference)
 
     def snapshot(self) -> dict[str, Any]:
         """State for `load`, bit-exact."""

@@ -49,7 +49,7 @@ class StretchWindows:
         """The same, none of the windows used for this reason."""
         return replace(self, windows=[replace(w, used=False, reason=w.reason or reason) for w in self.windows])
 
-    def told(self, numbers: Mapping[str, float]) -> StretchWindows:
+    def with_numbers(self, numbers: Mapping[str, float]) -> StretchWindows:
         """The same with numbers more in each window."""
         return replace(self, windows=[replace(w, numbers={**w.numbers, **numbers}) for w in self.windows])
 

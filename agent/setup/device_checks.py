@@ -21,7 +21,7 @@ from agent.setup.finding import Finding
 from hw.block import BlockFlags
 from hw.fifo_options import FifoOptions
 from hw.fifo_sensor import FifoSensor
-from hw.promises import BlockCheck, checked_drops, checked_info, told_as
+from hw.promises import BlockCheck, as_driver_fault, checked_drops, checked_info
 from hw.sensor import AdapterError, DeviceError, Options, Sensor, load_driver, system_clock
 
 RATE_WITHIN = 0.02  # relative; oscillators of MEMS are off by 1 % or less
@@ -130,7 +130,7 @@ def answer_findings(config: Config, options: Mapping[str, Options]) -> Iterator[
             remedy = "connect the device, or correct its options; `fieldcal probe` lists what answers"
             yield Finding("device", "fault", f"{device.name}: {error}", remedy)
         except Exception as error:  # a third party's driver may raise anything
-            yield _bad_driver(device, told_as(error))
+            yield _bad_driver(device, as_driver_fault(error))
         else:
             used = f", used by {used_by}" if used_by else ""
             says = f"{device.name}: {identity} answers on {held.node}, one register read a transfer{used}"
@@ -204,7 +204,7 @@ def _measured(device: Device, options: Options, duration_s: float) -> Finding:
     except DeviceError as error:
         return Finding("throughput", "fault", f"{device.name}: {error}", "connect the device, or correct its options")
     except BaseException as error:  # a third party's driver may raise anything
-        return _bad_driver(device, told_as(error))
+        return _bad_driver(device, as_driver_fault(error))
 
 
 def _bad_driver(device: Device, fault: str) -> Finding:

@@ -23,7 +23,7 @@ from calib.estimate.determined import Flags, determined
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare
-from calib.estimate.response_told import KnownResponses, ResponseTold, response_told, told_at_one_frequency
+from calib.estimate.response_told import KnownResponses, ResponseTold, response_at_one_frequency, response_of
 from calib.model import Array, Calibration, Window
 from calib.windows.banded import Factors
 from calib.windows.bands import LEAST_SHARE, motion_band_hz
@@ -263,7 +263,7 @@ def _response(
     own = np.flatnonzero([t.kind is RESPONSE for t in nuisances.terms])
     applied = np.array([nuisances.terms[j].applied for j in own])
     chosen = np.concatenate([np.arange(9), 12 + own])
-    told = told_at_one_frequency if model.one_frequency else partial(response_told, from_hz=model.from_hz)
+    told = response_at_one_frequency if model.one_frequency else partial(response_of, from_hz=model.from_hz)
     return told(
         np.append(solution.x[:9], solution.x[12 + own] + applied),
         covariance[np.ix_(chosen, chosen)],

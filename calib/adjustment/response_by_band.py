@@ -28,7 +28,7 @@ UNSEEN = 1e-6  # part of an element of S that lies in directions which no window
 MOST_CHANGE = 0.5  # of ln S, from the mean frequency of the motion in a band to the middle of the band
 
 
-def told_by_band(found: Adjustment, windows: Sequence[Window]) -> ResponseTold | None:
+def response_by_band(found: Adjustment, windows: Sequence[Window]) -> ResponseTold | None:
     """What the adjustment says of the response, with the sensitivity of each band told by that band alone.
 
     `windows`, from which the same lag is taken out as from those of the adjustment, and no response. Their bands are

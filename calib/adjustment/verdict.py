@@ -11,7 +11,7 @@ from calib.adjustment.budget import Budget
 from calib.adjustment.mistakes import FACTORS, of_a_prior, of_means, with_unit
 from calib.adjustment.solution import Solution
 from calib.distributions import chi2_quantile, coverage_factor
-from calib.estimate.axes import LEAST_S, sensitivity_reasons, where_nothing_moved
+from calib.estimate.axes import LEAST_S, sensitivity_reasons, silent_directions
 from calib.estimate.determined import Flags
 from calib.estimate.quantities import LAG
 from calib.model import PARAMETERS, Array, Calibration, Window
@@ -111,7 +111,7 @@ def nothing_determined(solution: Solution, determined: Flags) -> list[str]:
             "the data add too little to the priors: they halve the standard uncertainty of no parameter; "
             "measure longer, with more motion or in more positions"
         ]
-    where = where_nothing_moved(equations.unexcited)
+    where = silent_directions(equations.unexcited)
     return [
         f"rank {equations.rank} of 4: the data determine none of the 12 parameters"
         f"{': ' if where else ''}{where}; measure with more motion or in more positions"

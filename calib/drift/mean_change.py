@@ -43,7 +43,7 @@ class MeanChange:
     unseen: tuple[str, ...]
 
     @property
-    def told(self) -> str:
+    def sentence(self) -> str:
         """In a sentence; "" where nothing has changed."""
         if not self.significant:
             return ""

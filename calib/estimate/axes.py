@@ -185,7 +185,7 @@ def _listed(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-def where_nothing_moved(unexcited: Array) -> str:
+def silent_directions(unexcited: Array) -> str:
     """A sentence on the directions (k, 3) in the sensor's frame that nothing excites; "" where there is no motion, or
     motion in all directions."""
     if len(unexcited) == 1:

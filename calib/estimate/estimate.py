@@ -345,12 +345,12 @@ class _Passes:
         ]
         self.mean, self.u = unknowns.prior
         self._segments = self._between_steps()
-        self._rows, self.by_record = self._made(self.mean), list[Array]()
+        self._rows, self.by_record = self._rows_at(self.mean), list[Array]()
         # What a window without a temperature weighs depends on how Q changes with temperature.
         untold = any(not np.isfinite(r.temperature_degc) for r in records)
         self.unsure = bool(untold and np.isfinite(seen_degc).all())
 
-    def _made(self, x: Array) -> Rows:
+    def _rows_at(self, x: Array) -> Rows:
         degrees = Degrees.of(self.unknowns, self.seen_degc, x)
         return Rows(self.unknowns, self.records, self.days[self.epoch_of], self.noise, degrees)
 
@@ -393,7 +393,7 @@ class _Passes:
     def lines_at(self, x: Array) -> Linearised:
         """All lines at x (K, N); the rows of each record are then in `by_record`."""
         if self.unsure:
-            self._rows = self._made(x[-1])
+            self._rows = self._rows_at(x[-1])
         around, size = self.around(x), len(self.unknowns)
         self.by_record = self._rows.at(x[self.epoch_of], around[self.epoch_of]) if self.records else []
         by_epoch: list[list[Array]] = [[] for _ in self.days]

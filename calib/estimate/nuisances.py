@@ -81,7 +81,7 @@ class Priors(StatedValues):
         late = {"lag_at_s": self.lag_at_s + known.group_delay_s} if known.is_stated else {}
         return replace(self.with_values(late), known=known)
 
-    def _known_told(self, frequency_hz: float, to_hz: float = 0.0) -> dict[str, float]:
+    def _of_known_filters(self, frequency_hz: float, to_hz: float = 0.0) -> dict[str, float]:
         """What known filters make of S, if it holds at this frequency, from a motion up to `to_hz`.
 
         `known_size`: ln |h| of the sensor's. `reference_share`: of what is left of ln |h|, the other part is the
@@ -107,7 +107,7 @@ class Priors(StatedValues):
         model = ResponseModel(to_hz, (from_hz or band_hz[0]) if self.corner_unknown else 0.0)
         u = min(RESPONSE_U, self.known.u_response(to_hz))
         told = {"response": u, "response_at": 0.0, "reference_frequency_hz": stated_hz}
-        return replace(self.with_values({**told, **self._known_told(stated_hz, to_hz)}), response_model=model)
+        return replace(self.with_values({**told, **self._of_known_filters(stated_hz, to_hz)}), response_model=model)
 
     @property
     def output_per_mps2(self) -> float | None:
@@ -141,7 +141,7 @@ class Priors(StatedValues):
         at_hz = self.reference_frequency_hz or motion_hz
         told = {"response": u, "response_at": attenuated, "reference_frequency_hz": at_hz}
         model = ResponseModel(motion_hz, one_frequency=True)
-        return replace(self.with_values({**told, **self._known_told(at_hz)}), response_model=model)
+        return replace(self.with_values({**told, **self._of_known_filters(at_hz)}), response_model=model)
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,7 +45,7 @@ class ReferenceShare:
         """The share whose `asdict` this is, with lists in the place of tuples."""
         return cls(**{**state, "unknowns": tuple(state["unknowns"]), "kinds": tuple(state["kinds"])})
 
-    def told(self, serial_number: str, certificate_sha256: str) -> dict[str, Any]:
+    def as_object(self, serial_number: str, certificate_sha256: str) -> dict[str, Any]:
         """The share as results state it (docs/shared-errors.md): `derivative` has a row for each unknown."""
         return {
             "reference": self.reference, "serial_number": serial_number, "certificate_sha256": certificate_sha256,

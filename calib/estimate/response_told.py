@@ -80,7 +80,7 @@ class ResponseTold:
         return bool(np.all(left < np.maximum(NEAR, left_u * u)))
 
 
-def response_told(
+def response_of(
     estimate: Array,
     covariance: Array,
     effects: Array,
@@ -116,7 +116,7 @@ def response_told(
     )
 
 
-def told_at_one_frequency(
+def response_at_one_frequency(
     estimate: Array,
     covariance: Array,
     effects: Array,

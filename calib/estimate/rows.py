@@ -56,29 +56,29 @@ class NoiseScores:
         return NoiseScores(self.scores * 0.5 ** (record.windows / HALF_WINDOWS) + record.scores)
 
     @cached_property
-    def _found(self) -> tuple[Scattered | None, Scattered | None]:
+    def _scattered(self) -> tuple[Scattered | None, Scattered | None]:
         return scattered(self.scores[0]), scattered(self.scores[1])
 
     @property
     def slopes(self) -> float:
         """Variance of slopes over that of white noise."""
-        return _beside_white(self._found[0])
+        return _beside_white(self._scattered[0])
 
     @property
     def means(self) -> float:
         """Variance of means over that of white noise."""
-        return _beside_white(self._found[1])
+        return _beside_white(self._scattered[1])
 
     @property
     def degrees_of_freedom(self) -> float:
         """Of the one that is known from less; 0 where none is known."""
-        return min((found.degrees_of_freedom for found in self._found if found is not None), default=0.0)
+        return min((found.degrees_of_freedom for found in self._scattered if found is not None), default=0.0)
 
 
 def _beside_white(found: Scattered | None) -> float:
     if found is None:
         return 1.0
-    return found.known * found.variance + 1.0 - found.known
+    return found.share_known * found.variance + 1.0 - found.share_known
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ class Rows:
             near = [noise[w] for w in at]
             slopes = _Slopes(own, windows, unknowns, near, degrees)
             means = _Means(own, windows, unknowns, near, degrees)
-            by_bands = _told(own) if told else None
+            by_bands = _response_information(own) if told else None
             self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, by_bands))
 
     def at(self, x: Array, around: Array) -> list[Array]:
@@ -217,7 +217,7 @@ class _Group:
         return found
 
 
-def _told(records: Sequence[Record]) -> Array:
+def _response_information(records: Sequence[Record]) -> Array:
     """(W, TOLD, TERMS + 1) what the bands of each record tell of the response."""
     found = np.zeros((len(records), TOLD, TERMS + 1))
     for own, record in zip(found, records, strict=True):

@@ -289,7 +289,7 @@ class Unknowns:
                     effect[:, rate] += away * effect[:, p]
         key = record.setting, record.lag_s, record.response
         if key not in self._taken_out:
-            self._taken_out[key] = self._found_taken_out(record)
+            self._taken_out[key] = self._response_taken_out(record)
         return effect, self._taken_out[key]
 
     def _above_k(self, record: Record) -> float:
@@ -297,7 +297,7 @@ class Unknowns:
         degc = record.temperature_degc
         return degc - self.statements.temperature.reference_degc if record.tells_temperature else 0.0
 
-    def _found_taken_out(self, record: Record) -> Array:
+    def _response_taken_out(self, record: Record) -> Array:
         found, priors = np.zeros(len(self.all)), self.statements.of(record.reference)
         values = {
             kinds.LAG: (record.lag_s,), kinds.RESPONSE: record.response,

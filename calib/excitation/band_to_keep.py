@@ -48,7 +48,7 @@ def band_to_keep(
     whole = u[np.isfinite(u).all(axis=1)]  # one missing sample of the reference makes some of them NaN
     power = np.var(whole, axis=0).max(initial=0.0) if len(whole) else 0.0
     noisy = np.max(unlimited[0] ** 2, initial=0.0) > NOISE_MATTERS * power
-    ends_hz = [found_hz if noisy else None, _told_hz(raw, V, instrument, rates_hz, found_hz)]
+    ends_hz = [found_hz if noisy else None, _limit_hz(raw, V, instrument, rates_hz, found_hz)]
     ends_hz.append(None if to_hz is None else to_hz / STOP_BAND)
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
     if band_hz is None:
@@ -57,7 +57,7 @@ def band_to_keep(
     return band_hz, noise_in_bands(instrument.known.noise(float(noise_hz[0]), rate_hz) * density, noise_hz, derivatives)
 
 
-def _told_hz(
+def _limit_hz(
     raw: Array, V: Array, instrument: Instrument, rates_hz: tuple[float, float], found_hz: float | None
 ) -> float | None:
     """Where to limit both signals so that the sensor shows no motion that the reference cannot tell.

@@ -329,7 +329,7 @@ def _motion(
         against = None
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     taken = () if response.is_flat else response.terms
-    made = [replace(_slow(_told(w, found), found.points), u_lag_s=u_lag_s, response=taken) for w in made]
+    made = [replace(_slow(_with_numbers(w, found), found.points), u_lag_s=u_lag_s, response=taken) for w in made]
     # Where the noise of the reference is stated, all other noise is the sensor's.
     sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
     return [_with_noise(w, sensor_noise, against) for w in made]
@@ -391,7 +391,7 @@ def _silent(window: Window) -> bool:
     return noisy or window.kind == "quiet"
 
 
-def _told(window: Window, found: Aligned) -> Window:
+def _with_numbers(window: Window, found: Aligned) -> Window:
     """The window with what was known before the filter, and what the filter left."""
     window = replace(window, independent=found.independent, numbers={**window.numbers, **found.filled})
     if window.kind == "rest":

@@ -148,17 +148,17 @@ def clamp_angles(
         told = f"u(alpha) = {np.degrees(u_alpha):.3g} deg and u(theta) = {np.degrees(u_theta):.3g} deg"
         return Placed(None, f"gravity gives only {told}; {np.degrees(WIDEST_RAD):.0f} deg is the limit", numbers)
     if theta_rad is None:
-        return Placed(_found(found_theta, alpha, gravity, position, u_alpha, u_theta), "", numbers)
+        return Placed(_clamp_pose(found_theta, alpha, gravity, position, u_alpha, u_theta), "", numbers)
     limit = chi2_quantile(1.0 - FALSE_REFUSALS, 1.0) * (u_theta**2 + knowledge.angle_rad**2)
     if (abs(theta_rad) - found_theta) ** 2 > limit:
         told = f"gravity shows theta = {np.degrees(found_theta):.4g} deg, {np.degrees(theta_rad):.4g} deg is stated"
         most = np.degrees(np.sqrt(limit))
         return Placed(None, f"{told}: they may differ by {most:.2g} deg at most", numbers)
     alpha += np.pi if theta_rad < 0.0 else 0.0
-    return Placed(_found(theta_rad, alpha, gravity, position, u_alpha, 0.0), "", numbers)
+    return Placed(_clamp_pose(theta_rad, alpha, gravity, position, u_alpha, 0.0), "", numbers)
 
 
-def _found(
+def _clamp_pose(
     theta: float, alpha: float, gravity: tuple[float, int], position: str, u_alpha: float, u_theta: float
 ) -> Pose:
     pose = clamp(theta, alpha, *gravity, position)

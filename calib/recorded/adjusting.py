@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.adjustment.adjustment import Adjustment, adjust
 from calib.adjustment.norm_fit import norm_fit
-from calib.adjustment.response_by_band import told_by_band
+from calib.adjustment.response_by_band import response_by_band
 from calib.adjustment.verdict import MOST_BETWEEN_BANDS, response_reasons
 from calib.estimate.nuisances import Applied, Priors
 from calib.estimate.quantities import RESPONSE
@@ -28,7 +28,7 @@ from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
 from calib.recorded.table import SensorTable
 from calib.recorded.tables import Tables
 from calib.rounding import from_to
-from calib.signal.known_response import known_of
+from calib.signal.known_response import known_response_of
 from calib.signal.order_statistics import median
 from calib.signal.response import FLAT, UNSETTLED, Response
 from calib.signal.stamps import clock_from_stamps
@@ -93,7 +93,7 @@ def adjusted(
     if certificate is not None:
         share = replace(share, sensitivity=certificate.sensitivity)
     identity = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
-    return replace(outcome, more={**outcome.more, "shared_errors": [share.told(*identity)]})
+    return replace(outcome, more={**outcome.more, "shared_errors": [share.as_object(*identity)]})
 
 
 def _across(seen: float, stated: float) -> str:
@@ -125,7 +125,7 @@ def _with_remedy(outcome: Outcome, tables: Tables, priors: Priors) -> Outcome:
     says how to state that. Noise of a reference may look like a response that nobody can believe."""
     if not outcome.reasons or priors.known.is_stated or len(outcome.more.get("response") or ()) < 2:
         return outcome
-    if _adjusted(tables, priors.beside_known(known_of(["flat"], ["flat"]))).outcome.reasons:
+    if _adjusted(tables, priors.beside_known(known_response_of(["flat"], ["flat"]))).outcome.reasons:
         return outcome
     *others, last = outcome.reasons
     remedy = "if no filter of sensor and reference matters in the motion's band, state `sensor_filter` flat"
@@ -261,7 +261,7 @@ class _Search:
     def by_band(self, found: Adjustment, lag_s: float) -> ResponseTold | None:
         """The response as each band tells it by itself, where no smooth one is right; `found` is of windows from which
         this lag was taken out."""
-        return told_by_band(found, self._tables.of_any_response(lag_s))
+        return response_by_band(found, self._tables.of_any_response(lag_s))
 
     def of_any_response(self, lag_s: float) -> tuple[Band, ...]:
         """`narrower` where no window can be used: perhaps because of what the response makes of the motion."""

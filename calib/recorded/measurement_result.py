@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.estimate.axes import where_nothing_moved
+from calib.estimate.axes import silent_directions
 from calib.estimate.response_told import BandSensitivity
 from calib.model import Array, Calibration, Window
 from calib.output_unit import shown_in
@@ -122,7 +122,7 @@ class MeasurementResult:
     @property
     def where_nothing_moved(self) -> str:
         """The directions that nothing excited, as a sentence; "" where all were."""
-        return where_nothing_moved(np.reshape(self.more.get("unexcited_directions", ()), (-1, 3)))
+        return silent_directions(np.reshape(self.more.get("unexcited_directions", ()), (-1, 3)))
 
     @property
     def response(self) -> tuple[BandSensitivity, ...]:

@@ -13,7 +13,7 @@ from calib.model import PARAMETERS, Array, Calibration
 from calib.recorded.errors import OptionError
 from calib.recorded.options import STATED, Options
 from calib.signal.instrument import Instrument
-from calib.signal.known_response import KnownResponse, known_of
+from calib.signal.known_response import KnownResponse, known_response_of
 
 # Without a stated local value, standard gravity is used. Its error is up to 0.3 %: gravity differs by 0.05 m/s2 between
 # the poles and the equator.
@@ -35,7 +35,7 @@ def priors_of(options: Options) -> Priors:
 def known_response(options: Options) -> KnownResponse:
     """What is stated of the filters of both instruments; by the reference's certificate, where the options do not."""
     certificate = options.reference_certificate
-    of_both = known_of(options.sensor_filter, options.reference_filter)
+    of_both = known_response_of(options.sensor_filter, options.reference_filter)
     if options.reference_filter or certificate is None or not certificate.filters:
         return of_both
     return replace(of_both, reference=certificate.filters)

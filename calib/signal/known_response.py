@@ -106,15 +106,15 @@ class KnownResponse:
         """Standard uncertainty of the terms of what is left (calib.signal.response), in units of those of a low-pass
         filter at the upper end of the motion; inf where the filters of one instrument are not stated, or not known so
         far."""
-        return _what_is_left(self, to_hz)[0] if self._known_to(to_hz) else math.inf
+        return _remaining_u(self, to_hz)[0] if self._covers(to_hz) else math.inf
 
     def u_beside_terms(self, to_hz: float) -> float:
         """Relative standard uncertainty of S where no such terms up to a frequency explain all that is left."""
-        return _what_is_left(self, to_hz)[1] if self._known_to(to_hz) else 0.0
+        return _remaining_u(self, to_hz)[1] if self._covers(to_hz) else 0.0
 
     def u_size(self, frequency_hz: float) -> float:
         """Relative standard uncertainty of what is left at one frequency; inf as in `u_response`."""
-        return _u_size(self._all, frequency_hz) if self._known_to(frequency_hz) else math.inf
+        return _u_size(self._all, frequency_hz) if self._covers(frequency_hz) else math.inf
 
     def of_reference(self, frequency_hz: float) -> tuple[float, float]:
         """The share of the reference in ln |h| of what is left at a frequency, by what is stated of both, and the
@@ -122,7 +122,7 @@ class KnownResponse:
 
         Where the filters of one are not stated, all is the sensor's.
         """
-        if not self._known_to(frequency_hz):
+        if not self._covers(frequency_hz):
             return 0.0, 0.0
         u, of_reference = (_u_size(of or (), frequency_hz) for of in (self.sensor, self.reference))
         both = math.hypot(u, of_reference)
@@ -132,14 +132,14 @@ class KnownResponse:
     def _all(self) -> tuple[Filter, ...]:
         return (*(self.sensor or ()), *(self.reference or ()))
 
-    def _known_to(self, frequency_hz: float) -> bool:
+    def _covers(self, frequency_hz: float) -> bool:
         return self.is_complete and all(frequency_hz <= f.to_hz for f in self._all)
 
 
 UNKNOWN = KnownResponse()
 
 
-def known_of(sensor: Sequence[str] | None, reference: Sequence[str] | None) -> KnownResponse:
+def known_response_of(sensor: Sequence[str] | None, reference: Sequence[str] | None) -> KnownResponse:
     """The filters that lines of text state; None or no line: nobody states any. Raises ValueError."""
     return KnownResponse(*(tuple(map(filter_of, lines)) if lines else None for lines in (sensor, reference)))
 
@@ -171,7 +171,7 @@ def _not_0(h: Complex) -> Complex:
 
 
 @lru_cache(maxsize=16)
-def _what_is_left(known: KnownResponse, to_hz: float) -> tuple[float, float]:
+def _remaining_u(known: KnownResponse, to_hz: float) -> tuple[float, float]:
     """What `u_response` and `u_beside_terms` are where all is stated."""
     frequency_hz = np.linspace(0.0, LAST * to_hz, LINES + 1)[1:]
     omega, unit = 2.0 * np.pi * frequency_hz, in_units(to_hz)

@@ -75,7 +75,7 @@ def stated_date(records: Sequence[Record], day: float) -> Date:
     return Date.of(np.array([before, max(before, after)]), np.ones(1), by_windows=False)
 
 
-def found_date(whole: Estimate, then: Then, day: float, begin: float, end: float) -> Date:
+def date_of_change(whole: Estimate, then: Then, day: float, begin: float, end: float) -> Date:
     """Of the change that is stated to be on `day`, just after `then`, as the windows tell it: any time from `begin` to
     `end` is as likely beforehand."""
     ends = np.array([day for record in whole.records for day in record.days])

@@ -12,7 +12,7 @@ import numpy as np
 from calib.estimate.estimate import Now
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import RESPONSE, Quantity
-from calib.estimate.response_told import LEFT_U, KnownResponses, ResponseTold, response_told, told_at_one_frequency
+from calib.estimate.response_told import LEFT_U, KnownResponses, ResponseTold, response_at_one_frequency, response_of
 from calib.model import Array
 from calib.signal.response import FLAT, NEAR, POWERS, Complex, Response, attenuating, by_term, in_units
 from calib.windows.deviations import Deviations, LeftOpen
@@ -114,7 +114,7 @@ class OverFrequency:
         deviations, left_open = self.deviations.plus(record.deviations), self.left_open.plus(record.left_open)
         return replace(self, deviations=deviations, left_open=left_open)
 
-    def told_since(self, before: OverFrequency, priors: Priors) -> str:
+    def news(self, before: OverFrequency, priors: Priors) -> str:
         """For the operator: the band that was settled since; "" if nothing was."""
         several = self.windows >= SEVERAL > before.windows and not self.fixed
         another = self.motion_hz != before.motion_hz and before.motion_hz is not None
@@ -211,16 +211,18 @@ class OverFrequency:
         terms[: len(own)] = unit[: len(own)] * state.mean[own]
         return terms
 
-    def told(self, state: Now, reference: str, priors: Priors, coverage_factor: float) -> ResponseTold | None:
+    def response_over_frequency(
+        self, state: Now, reference: str, priors: Priors, coverage_factor: float
+    ) -> ResponseTold | None:
         """The response beside a reference; None where it is no unknown."""
         own = terms_of(state, reference)
         if self.motion_hz is None:
-            return self._told_at_one_frequency(state, reference, priors, coverage_factor)
+            return self._at_one_frequency(state, reference, priors, coverage_factor)
         if not own:
             return None
         chosen, effects = [*range(9), *own], np.diag(in_units(self.to_hz))
         factor, hz = self.factor(state, reference, priors)[chosen], self.stated(priors).reference_frequency_hz
-        return response_told(
+        return response_of(
             state.mean[chosen], factor @ factor.T, effects, hz, self.motion_hz, coverage_factor, per_octave=1.0,
             known=KnownResponses.of(self.stated(priors)),
         )  # fmt: skip
@@ -247,7 +249,7 @@ class OverFrequency:
         own = attenuation_of(state, reference)
         return own, attenuating(self.first_hz) if own else np.zeros(len(POWERS))
 
-    def _told_at_one_frequency(
+    def _at_one_frequency(
         self, state: Now, reference: str, priors: Priors, coverage_factor: float
     ) -> ResponseTold | None:
         own = attenuation_of(state, reference)
@@ -256,7 +258,7 @@ class OverFrequency:
         chosen, effects = [*range(9), *own], attenuating(self.first_hz)[None]
         factor, hz = self.factor(state, reference, priors)[chosen], self.stated(priors).reference_frequency_hz
         band_hz = (self.first_hz, self.first_hz)
-        return told_at_one_frequency(
+        return response_at_one_frequency(
             state.mean[chosen],
             factor @ factor.T,
             effects,

@@ -38,7 +38,7 @@ from calib.estimate.statements import DOUBT, Dated, Statements, Step, Widening
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import Array, Calibration, scale_of
 from calib.signal.response import Response
-from calib.state.dating import Date, found_date, stated_date
+from calib.state.dating import Date, date_of_change, stated_date
 from calib.state.over_frequency import SEVERAL, OverFrequency, changed
 from calib.state.past import Past, StatedChange, epoch_days
 from calib.state.sources import Sources
@@ -243,9 +243,11 @@ class State:
         """Whether the response beside the reference is surely another than in an earlier state."""
         return self._over.differs(self._now, than._now, self.reference(place))
 
-    def response_told(self, place: int = FIRST) -> ResponseTold | None:
+    def response_over_frequency(self, place: int = FIRST) -> ResponseTold | None:
         """What is known of it, by frequency; None where it is no unknown."""
-        return self._over.told(self._now, self.reference(place), self._priors[0], self.coverage_factor)
+        return self._over.response_over_frequency(
+            self._now, self.reference(place), self._priors[0], self.coverage_factor
+        )
 
     @property
     def reference_frequency_hz(self) -> float:
@@ -266,7 +268,7 @@ class State:
 
     def settled_since(self, earlier: State) -> str:
         """For the operator: which band and frequency several windows settled since an earlier state; or ""."""
-        return self._over.told_since(earlier._over, self._priors[0])
+        return self._over.news(earlier._over, self._priors[0])
 
     def _determined(self, mean: Array, covariance: Array) -> Flags:
         return determined(mean, np.sqrt(covariance.diagonal()), self._u, np.ones(12, dtype=bool))
@@ -398,7 +400,7 @@ class State:
         if all("remount" in kind.loosened_by for kind in kinds) or any(own.day == day for own in self._dated):
             return partial(stated_date, whole.records, day)
         begin, end = max(d for d in known if d < day), min((d for d in known if d > day), default=day)
-        return cache(partial(found_date, whole, then, day, begin, end))
+        return cache(partial(date_of_change, whole, then, day, begin, end))
 
     def budget(self, whole: Estimate | None = None, place: int = FIRST) -> Sources:
         """What makes U of S and Q (see `result`) by a solution of the whole; None: it is solved anew."""
@@ -747,7 +749,7 @@ class State:
         if changed:
             was = self.result(place)
             self.solve()
-            changed = not _same(was, self.result(place))
+            changed = not _equal(was, self.result(place))
         else:
             self._restated()
         if present not in ("", owner):
@@ -790,7 +792,7 @@ class State:
             return False
         self._stated_then = None
         self.solve()
-        return not _same(before, self.result())
+        return not _equal(before, self.result())
 
     def put(self, calibration: Calibration, day: float | None = None) -> None:
         """S and Q as an operator wants them, on a day after the newest window; None: just after it. Older windows tell
@@ -880,6 +882,6 @@ def _renamed(key: str, end: str, new: str) -> str:
     return key
 
 
-def _same(one: Calibration, other: Calibration) -> bool:
+def _equal(one: Calibration, other: Calibration) -> bool:
     alike = np.array_equal(one.sensitivity, other.sensitivity) and np.array_equal(one.offset, other.offset)
     return bool(alike and np.array_equal(one.covariance, other.covariance))

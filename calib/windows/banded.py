@@ -74,7 +74,7 @@ def banded(
             projected[w] = _projected(factors, powers, omega2[w])
             left_open = left_open.plus(_left_open(factors, powers))
             if not one_frequency:
-                together.add(_told(factors, powers))
+                together.add(_explained_power(factors, powers))
     return together.result(projected, left_open)
 
 
@@ -195,7 +195,7 @@ class _WindowBands:
     moved: float
 
 
-def _told(factors: Factors, powers: int) -> _WindowBands:
+def _explained_power(factors: Factors, powers: int) -> _WindowBands:
     terms = by_term(factors.omega, powers)
     own = factors.seen(np.ones(len(terms), dtype=complex))
     lagged = factors.seen(-1j * factors.omega)

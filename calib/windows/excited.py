@@ -200,7 +200,7 @@ def _surely_shared(found: Excitation, across: Array) -> Array:
     moving, power = np.flatnonzero(np.tile(found.live, 2)), _power(window)
     clean = _clean(power, found.noise)
     both = across @ clean[:m, moving]
-    told = _told_by(both, clean, found.noise, power, moving)
+    told = _regression(both, clean, found.noise, power, moving)
     noise = (across**2 @ found.noise[0]) * len(moving) / (window.independent * window.sums.count.sum())
     return np.where((np.sum(told * both, axis=1) > OVER_NOISE * noise)[:, None], told, 0.0)
 
@@ -295,7 +295,7 @@ def _shared(window: Window, live: NDArray[np.bool_], noise: Array) -> tuple[Arra
     if live.any() and not live.all():
         moving = np.flatnonzero(np.tile(live, 2))
         both = power[np.ix_(np.flatnonzero(~live), moving)]
-        found[np.ix_(~live, np.tile(live, 2))] = _told_by(both, _clean(power, noise), noise, power, moving)
+        found[np.ix_(~live, np.tile(live, 2))] = _regression(both, _clean(power, noise), noise, power, moving)
     return found[:, :m], found[:, m:]
 
 
@@ -304,7 +304,7 @@ def _clean(power: Array, noise: Array) -> Array:
     return np.asarray(power - np.diag(np.minimum(noise.ravel(), MOST_NOISE * power.diagonal())))
 
 
-def _told_by(both: Array, clean: Array, noise: Array, power: Array, moving: NDArray[np.intp]) -> Array:
+def _regression(both: Array, clean: Array, noise: Array, power: Array, moving: NDArray[np.intp]) -> Array:
     """(j, k) regression on the channels `moving` (k,) of [u, du/dt], with which signals have the covariance `both`.
 
     Of a tone on an ellipse, du/dt is a sum of the channels of u: in such a combination the subtraction leaves noise

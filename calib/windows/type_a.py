@@ -111,7 +111,7 @@ def pooled(
     mean_cov, of_means, mean_sums = _scatter(mean_scores, 3)
     found = [own for own in (of_slopes, of_means) if own is not None]
     freedom = min((own.degrees_of_freedom for own in found), default=np.inf)
-    known = min((own.known for own in found), default=0.0)
+    known = min((own.share_known for own in found), default=0.0)
     return TypeA(noise, slope_cov, mean_cov, freedom, known, np.array([sums, mean_sums]))
 
 
@@ -181,7 +181,7 @@ class Scattered:
         return self.freedom / 3.0 if self.inflation > 1.0 else self.freedom
 
     @property
-    def known(self) -> float:
+    def share_known(self) -> float:
         """How far segments tell the variance, 1 where they are enough."""
         return min(self.freedom / FEWEST_FREEDOM, 1.0)
 

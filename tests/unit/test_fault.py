@@ -13,7 +13,7 @@ import pytest
 from agent.core import channel, streams
 from agent.core.estimation import Estimation
 from agent.core.events import DeviceChange, StatusChange, WindowReport
-from agent.core.fault import told
+from agent.core.fault import description
 from agent.core.pipeline import Pipeline
 from agent.recording.messages import decode, encode
 from agent.supervision.notify import SystemdNotifier
@@ -103,7 +103,7 @@ def test_a_run_with_a_fault_replays_to_the_same_results(monkeypatch: pytest.Monk
 def test_an_exception_that_no_line_of_the_program_raised_has_no_place() -> None:
     with pytest.raises(np.linalg.LinAlgError) as caught:
         np.linalg.inv(np.zeros((2, 2)))
-    assert told(caught.value) == "LinAlgError at an unknown place: Singular matrix"  # tests are not the program
+    assert description(caught.value) == "LinAlgError at an unknown place: Singular matrix"  # tests are not the program
 
 
 def test_the_supervision_logs_a_fault_as_an_error(

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import butter, freqs, freqz, group_delay
 
 from calib.signal.known_filters import filter_of
-from calib.signal.known_response import KnownResponse, known_of
+from calib.signal.known_response import KnownResponse, known_response_of
 from calib.signal.response import in_units
 
 HZ = np.linspace(0.0, 60.0, 121)
@@ -86,9 +86,9 @@ def test_a_line_that_states_no_filter_is_told(text: str, told: str) -> None:
 
 
 KNOWN = {
-    "low-pass in the sensor": known_of(["lowpass order=2 corner_hz=31"], ["flat"]),
-    "low-pass in the reference": known_of(["flat"], ["lowpass order=2 corner_hz=31"]),
-    "both": known_of(["sinc order=3 points=8 rate_hz=500", f"fir rate_hz=250 taps={','.join(map(str, TAPS))}"],
+    "low-pass in the sensor": known_response_of(["lowpass order=2 corner_hz=31"], ["flat"]),
+    "low-pass in the reference": known_response_of(["flat"], ["lowpass order=2 corner_hz=31"]),
+    "both": known_response_of(["sinc order=3 points=8 rate_hz=500", f"fir rate_hz=250 taps={','.join(map(str, TAPS))}"],
                      ["lowpass order=1 corner_hz=40"]),
 }  # fmt: skip
 
@@ -115,12 +115,12 @@ def ratio(known: KnownResponse, hz: float) -> complex:
 
 def test_what_is_left_of_a_filter_follows_from_its_corner() -> None:
     """A first-order corner that is larger by u changes c_k by -k u c_k: in units of a corner at the motion's end."""
-    known = known_of(["lowpass corner_hz=100 u_corner_pct=1"], ["flat"])
+    known = known_response_of(["lowpass corner_hz=100 u_corner_pct=1"], ["flat"])
     terms = 0.01 * np.arange(2, 7) * 0.2 ** np.arange(2, 7)
     assert in_units(20.0)[0] == pytest.approx(0.5 / (2.0 * np.pi * 20.0) ** 2)
     mount = 2.0 * 0.1**2
     assert known.u_response(20.0) == pytest.approx(float(np.hypot(terms.max(), mount)), rel=0.02)
-    assert known_of(["lowpass corner_hz=100"], None).u_response(20.0) == np.inf
+    assert known_response_of(["lowpass corner_hz=100"], None).u_response(20.0) == np.inf
 
 
 def _slope(h: complex) -> float:
@@ -135,7 +135,7 @@ def _exactly(text: str) -> str:
 
 def test_a_delay_alone_says_nothing_of_the_size_and_leaves_the_samples_as_they_are() -> None:
     delay = "delay delay_s=0.01"
-    alone, beside = known_of([delay], ["flat"]), known_of([delay, "flat u_pct=0.1"], ["flat"])
+    alone, beside = known_response_of([delay], ["flat"]), known_response_of([delay, "flat u_pct=0.1"], ["flat"])
     assert math.isinf(alone.u_response(10.0))
     assert beside.u_response(10.0) < 0.1
     u = np.random.default_rng(5).normal(size=(200, 1))

@@ -16,7 +16,7 @@ from calib import InputError, calibrate
 from calib.estimate.nuisances import Priors
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
-from calib.signal.known_response import UNKNOWN, KnownResponse, known_of
+from calib.signal.known_response import UNKNOWN, KnownResponse, known_response_of
 from tests.pair import Filter, Pair, decimator, lowpass, moving_mean, pair
 
 EXACT: dict[str, Any] = {"reference": 1e-9, "rotation_rad": 1e-9, "lag_axis_s": 1e-9}
@@ -59,7 +59,7 @@ def drawn(seed: int, order: int, corner_hz: float) -> Filter:
 def test_a_stated_filter_of_which_the_corner_is_a_tenth_off(order: int, in_reference: bool) -> None:
     """What is left is small: it is found with less uncertainty than a filter of which nothing is stated."""
     line, response = f"lowpass order={order} corner_hz=31", drawn(1, order, 31.0)
-    known = known_of(["flat"], [line]) if in_reference else known_of([line], ["flat"])
+    known = known_response_of(["flat"], [line]) if in_reference else known_response_of([line], ["flat"])
     made, found = recorded(1, response, known, in_reference=in_reference, noise_mps2=0.3)
     error, u = relative(made, found, response if in_reference else None)
     assert abs(error) < 2.0 * u
@@ -71,7 +71,7 @@ def test_a_stated_filter_of_which_the_corner_is_a_tenth_off(order: int, in_refer
 
 @pytest.mark.thorough
 def test_a_filter_whose_corner_is_within_the_motion_is_right_only_if_it_is_stated() -> None:
-    response, known = lowpass(4, 16.1), known_of(["lowpass order=4 corner_hz=16 u_corner_pct=1"], ["flat"])
+    response, known = lowpass(4, 16.1), known_response_of(["lowpass order=4 corner_hz=16 u_corner_pct=1"], ["flat"])
     made, found = recorded(2, response, known)
     error, u = relative(made, found)
     assert abs(error) < 2.0 * u < 5e-3
@@ -80,7 +80,9 @@ def test_a_filter_whose_corner_is_within_the_motion_is_right_only_if_it_is_state
 
 
 def test_a_corner_that_is_hardly_known_within_the_motion_determines_nothing() -> None:
-    _, found = recorded(2, lowpass(4, 16.0), known_of(["lowpass order=4 corner_hz=16 u_corner_pct=20"], ["flat"]))
+    _, found = recorded(
+        2, lowpass(4, 16.0), known_response_of(["lowpass order=4 corner_hz=16 u_corner_pct=20"], ["flat"])
+    )
     (reason,) = found.reasons
     assert reason.startswith("rank 3 of 4: the data determine none of the 12 parameters")
 
@@ -91,7 +93,7 @@ def test_decimators_by_their_taps_and_means(side: str) -> None:
     line = f"fir rate_hz=192 taps={','.join(map(repr, taps.tolist()))} ripple_pct=0.02"
     response: Filter = lambda f: decimator(24.0)(f) / taps.sum() * moving_mean(0.01)(f)  # noqa: E731
     lines = [line, "mean points=1000 rate_hz=100000"]
-    known = known_of(lines, ["flat"]) if side == "sensor" else known_of(["flat"], lines)
+    known = known_response_of(lines, ["flat"]) if side == "sensor" else known_response_of(["flat"], lines)
     made, found = recorded(3, response, known, in_reference=side == "reference")
     error, u = relative(made, found, response if side == "reference" else None)
     assert abs(error) < 2.0 * u < 1.5e-3
@@ -100,7 +102,7 @@ def test_decimators_by_their_taps_and_means(side: str) -> None:
 
 def test_the_response_of_the_sensor_is_told_with_its_filter_and_without_that_of_the_reference() -> None:
     of_sensor, of_reference = lowpass(2, 31.0), lowpass(1, 40.0)
-    known = known_of(["lowpass order=2 corner_hz=31 u_corner_pct=1"], ["lowpass corner_hz=40 u_corner_pct=1"])
+    known = known_response_of(["lowpass order=2 corner_hz=31 u_corner_pct=1"], ["lowpass corner_hz=40 u_corner_pct=1"])
     made, found = recorded(4, lambda f: of_sensor(f) / of_reference(f), known)
     at_hz = np.array([made.reference_frequency_hz])
     gain = made.sensitivity[0, 0] / abs(of_sensor(at_hz) / of_reference(at_hz))[0]
@@ -119,7 +121,7 @@ def test_coverage_with_corners_drawn_from_their_uncertainty() -> None:
     for seed in range(200, 224):
         random = np.random.default_rng([17, seed])
         order, corner_hz = int(random.choice([1, 2, 4])), float(random.choice([26.0, 31.0, 60.0]))
-        known = known_of([f"lowpass order={order} corner_hz={corner_hz}"], ["flat"])
+        known = known_response_of([f"lowpass order={order} corner_hz={corner_hz}"], ["flat"])
         response = lowpass(order, corner_hz * (1.0 + U_CORNER * float(random.normal())))
         made, found = recorded(
             seed, response, known, u_reference=2e-4, error=2e-4 * float(random.normal()), seconds=40.0

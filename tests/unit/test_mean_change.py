@@ -38,7 +38,7 @@ def test_a_tilt_is_a_tilt_or_q_and_no_sensitivity() -> None:
     size = np.linalg.norm(np.cross(LEAN, G)) / np.linalg.norm(G)
     assert abs(found.tilt_rad[0] - size) < 4.0 * found.tilt_rad[1] < 0.2 * size
     assert found.sensitivity == {}
-    assert "a tilt of the mount by 0.28°" in found.told
+    assert "a tilt of the mount by 0.28°" in found.sentence
 
 
 def test_a_sensitivity_of_the_upright_axis_is_that_or_q_and_no_tilt() -> None:
@@ -47,15 +47,15 @@ def test_a_sensitivity_of_the_upright_axis_is_that_or_q_and_no_tilt() -> None:
     [(axis, (share, u))] = found.sensitivity.items()
     assert axis == "z"
     assert abs(share + 0.011) < 4.0 * u < 0.002
-    assert "the sensitivity of z by -1.1 %" in found.told
+    assert "the sensitivity of z by -1.1 %" in found.sentence
     assert found.unseen == ("y",)
 
 
 def test_an_offset_along_no_single_axis_is_nothing_else() -> None:
     found = seen(np.array([0.05, 0.05, 0.08]))
     assert (found.tilt_rad, found.sensitivity) == (None, {})
-    assert "neither a tilt nor one axis" in found.told
-    assert "Q by as much" in found.told
+    assert "neither a tilt nor one axis" in found.sentence
+    assert "Q by as much" in found.sentence
 
 
 @pytest.mark.slow

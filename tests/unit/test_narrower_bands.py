@@ -14,7 +14,7 @@ from calib.recorded.errors import OptionError
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome
 from calib.signal.band import without_slow
-from calib.signal.known_response import known_of
+from calib.signal.known_response import known_response_of
 from tests.pair import Complex, Filter, Pair, decimator, flat, lowpass, pair, resonance
 
 U_REFERENCE = 1e-3
@@ -72,7 +72,7 @@ def test_a_resonance_contradicts_filters_that_are_stated_flat() -> None:
     +- 1.0, and the refusal without them said to state so."""
     own = resonance(2.8352614484851757, 33.43576076232283)
     made = pair(25, band_hz=(0.5, 10.0), rate_hz=100.0, seconds=60.0, skirts=4, response=lambda f: 1.0 / own(f))
-    flat_filters = Priors(reference=1e-3).beside_known(known_of(["flat"], ["flat"]))
+    flat_filters = Priors(reference=1e-3).beside_known(known_response_of(["flat"], ["flat"]))
     (reason,) = adjusted(made.files, flat_filters).reasons
     assert reason.startswith("the data contradict the stated filters of sensor and reference: chi-squared ")
 

@@ -14,7 +14,7 @@ import pytest
 from agent.core.events import CalibrationUpdate
 from agent.core.pipeline import Pipeline
 from calib.model import Array
-from calib.signal.known_response import known_of
+from calib.signal.known_response import known_response_of
 from hw.virtual.bench import Bench
 from hw.virtual.motion import sine
 from hw.virtual.presets import COUNTS_PER_MPS2, plain
@@ -64,7 +64,7 @@ def _u_main(lag_s: float) -> float:
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_known_filter_is_no_unknown_of_one_frequency(order: int) -> None:
     """First order at 31 Hz attenuates 6 Hz by 1.8 %; with the filter stated, u is hardly larger than without one."""
-    known = known_of([f"lowpass order={order} corner_hz=31 u_corner_pct=1"], ["flat"])
+    known = known_response_of([f"lowpass order={order} corner_hz=31 u_corner_pct=1"], ["flat"])
     priors, z, u = stated(**ANGLES).beside_known(known), [], []
     for seed in range(4):
         random = np.random.default_rng([7, seed])

@@ -15,7 +15,7 @@ from calib.estimate.statements import Dated, Statements, Step, Widening
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
 from calib.model import PARAMETERS, Calibration, Pose
-from calib.signal.known_response import known_of
+from calib.signal.known_response import known_response_of
 from calib.signal.response import FLAT
 from calib.state.over_frequency import OverFrequency
 from calib.state.state import State
@@ -199,7 +199,7 @@ def test_what_known_filters_leave_open_is_in_the_uncertainty_of_s() -> None:
     """At half the corner, |h| of a first order is (1 + 1/4)^-0.5, and changes by 0.2 % for each % of the corner. The
     data tell how much both filters attenuate together; what one of two alike has of it stays open by 1 / sqrt(2)."""
     filters = ["lowpass order=1 corner_hz=16 u_corner_pct=0.5"]
-    priors = Priors.none().beside_known(known_of(filters, filters))
+    priors = Priors.none().beside_known(known_response_of(filters, filters))
     now = estimate([record()], Statements(MEAN, U, {"": priors}, Wander(STILL), TemperatureModel())).now
     over = OverFrequency(first_hz=8.0, late_s=0.0)
     more = over.factor(now, "A", priors)[:12]

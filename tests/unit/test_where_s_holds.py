@@ -13,7 +13,7 @@ from calib.estimate.nuisances import Priors
 from calib.geometry import clamp
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
-from calib.signal.known_response import UNKNOWN, KnownResponse, known_of
+from calib.signal.known_response import UNKNOWN, KnownResponse, known_response_of
 from tests.pair import Filter, Pair, flat, lowpass, pair
 
 RATE_HZ, STAY_S, TURN_S, GRAVITY_MPS2, TONE_HZ = 100.0, 8.0, 2.0, 9.81, 7.8
@@ -202,7 +202,7 @@ def test_a_response_that_noise_makes_up_is_refused_with_a_remedy_that_works() ->
     _, found = weak(UNKNOWN)
     (reason,) = found.reasons
     assert "state `sensor_filter` flat `reference_filter` flat" in reason
-    made, found = weak(known_of(["flat"], ["flat"]))
+    made, found = weak(known_response_of(["flat"], ["flat"]))
     assert found.status == "valid"
     away = np.abs(found.sensitivity - made.sensitivity).ravel()
     assert np.all(away < found.expanded_uncertainty[:9])
