@@ -78,6 +78,8 @@ REVISIONS = (
     # The last before motion across a uniaxial reference was taken for another response, and at a fixed mount for a
     # change of S.
     Revision(19, "a65bd293c7b7", "0.3.0"),
+    # The last before a floor of motion, weaker than the sensor's noise, was no noise of the reference any more.
+    Revision(20, "00b8cff4d62e", "0.3.0"),
 )
 
 
