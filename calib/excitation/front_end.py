@@ -184,7 +184,7 @@ def aligned(
     hums_hz = hum_hz(columns[shown, 3 : 3 + m], columns[shown, :3], sensor_rate_hz) if settings.limit_band else []
     if hums_hz:
         columns = without_lines(columns, sensor_rate_hz, hums_hz)
-    rates_hz, together = (rate_hz, sensor_rate_hz), columns[shown, : 3 + m]
+    rates_hz, together = (rate_hz, sensor_rate_hz), columns[np.isfinite(columns).all(axis=1) & inside, : 3 + m]
     band_hz, noise = band_to_keep(raw, u, V, instrument, rates_hz, noise_hz, settings.to_hz, together)
     clipped, independent, unfiltered = 0, 1.0, as_measured.columns if struck.any() else columns
     if band_hz is not None and settings.limit_band:
