@@ -210,6 +210,7 @@ def white_noise(x: Array) -> Array:
 def moving_share(u: Array, V: Array, rate_hz: float, band_hz: tuple[float, float], derivatives: int) -> Array:
     """How much (m,) of the power of a reference u (n, m) between two frequencies is motion: the sensor's V (n, 3) shows
     it as well, with the sensitivity that it has for the whole motion, at any lag. From 0 to 1; 0 where it is not clear.
+    The quieter half of the frequencies counts.
 
     `derivatives`: how often the measured quantity was differentiated to give u; the power is that of the quantity.
     """
@@ -228,8 +229,9 @@ def moving_share(u: Array, V: Array, rate_hz: float, band_hz: tuple[float, float
     both = np.abs(np.einsum("gjl,gil,ij->gj", rows[:, :m].conj(), rows[:, m:], back)) / rows.shape[2]
     # Of independent noise, the square of a mean product is that of both powers over the number of independent lines.
     chance = own * (seen @ back**2) / (HANN_LINES * LINES_TOGETHER * min(parts.shape[1], len(u) / parts.shape[2]))
-    moved, power = np.sum(both**2 - chance, axis=0), np.sum(own**2, axis=0)
-    clear = moved > CLEAR * np.sqrt(np.sum(chance**2, axis=0))
+    quiet = own <= np.median(own, axis=0)  # the floor: what else is there may be a line, or the ends of a turn
+    moved, power = np.sum(both**2 - chance, axis=0, where=quiet), np.sum(own**2, axis=0, where=quiet)
+    clear = moved > CLEAR * np.sqrt(np.sum(chance**2, axis=0, where=quiet))
     share = np.divide(moved, power, out=np.zeros(m), where=clear & (power > 0.0))
     return np.asarray(np.sqrt(np.clip(share, 0.0, 1.0)))
 
