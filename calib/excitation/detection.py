@@ -223,16 +223,16 @@ def moving_share(u: Array, V: Array, rate_hz: float, band_hz: tuple[float, float
         return np.zeros(m)
     lines = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * window)[..., within]
     rows = _in_groups(lines / at_hz[within] ** derivatives)
-    slopes, *_ = np.linalg.lstsq(u - u.mean(axis=0), V - V.mean(axis=0), rcond=None)
-    back = np.linalg.pinv(slopes, ALIKE)
+    moved, shown = u - u.mean(axis=0), V - V.mean(axis=0)
+    back = np.linalg.pinv(np.linalg.pinv(moved.T @ moved, hermitian=True) @ (moved.T @ shown), ALIKE)
     own, seen = np.split(np.mean(np.abs(rows) ** 2, axis=2), [m], axis=1)
     both = np.abs(np.einsum("gjl,gil,ij->gj", rows[:, :m].conj(), rows[:, m:], back)) / rows.shape[2]
     # Of independent noise, the square of a mean product is that of both powers over the number of independent lines.
     chance = own * (seen @ back**2) / (HANN_LINES * LINES_TOGETHER * min(parts.shape[1], len(u) / parts.shape[2]))
     quiet = own <= np.median(own, axis=0)  # the floor: what else is there may be a line, or the ends of a turn
-    moved, power = np.sum(both**2 - chance, axis=0, where=quiet), np.sum(own**2, axis=0, where=quiet)
-    clear = moved > CLEAR * np.sqrt(np.sum(chance**2, axis=0, where=quiet))
-    share = np.divide(moved, power, out=np.zeros(m), where=clear & (power > 0.0))
+    told, power = np.sum(both**2 - chance, axis=0, where=quiet), np.sum(own**2, axis=0, where=quiet)
+    clear = told > CLEAR * np.sqrt(np.sum(chance**2, axis=0, where=quiet))
+    share = np.divide(told, power, out=np.zeros(m), where=clear & (power > 0.0))
     return np.asarray(np.sqrt(np.clip(share, 0.0, 1.0)))
 
 
