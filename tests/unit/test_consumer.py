@@ -292,7 +292,9 @@ def test_gateways_that_do_not_answer_delay_no_other(site: Site, gateway: Gateway
         silent = stranger.declare_queryable("fieldcal/v1/site/silent-$*/**", zenoh.handlers.FifoChannel(8))
         follower = Follower(consumer, gateway.base)
         for number in range(5):
-            stranger.put(f"fieldcal/v1/site/silent-{number}/mems/window", record(7).payload, attachment="0")
+            with stranger.declare_publisher(f"fieldcal/v1/site/silent-{number}/mems/window") as silently:
+                wait_for(lambda silently=silently: silently.matching_status.matching)  # type: ignore[misc]
+                silently.put(record(7).payload, attachment="0")
         queries = [next_query(silent) for _ in range(5)]  # none of them is answered
         began_s = time.monotonic()
         gateway.publisher.start()
