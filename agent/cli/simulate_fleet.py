@@ -24,6 +24,7 @@ FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; mea
 ROUTER_S = 30.0  # s to wait for a router
 STEP_S = 0.5
 DAY_S = 86400.0
+ENDED = "a process of the fleet ended: there is too little memory for so many gateways"
 NAMES_SHOWN = 5
 
 
@@ -93,12 +94,15 @@ def serve_fleet(options: FleetOptions, seed: int, duration_s: float | None) -> i
                 say(f"{fleet} gateways with {sensors} sensors each at {endpoint}, seed {seed}")
                 _say_odd(simulated)
                 step = _step_of(simulated, stop, options.truth, seed)
-                results = _run(step, stop, options, duration_s)
+                try:
+                    results = _run(step, stop, options, duration_s)
+                except BrokenProcessPool:  # the end of the fleet, below, sets `stop`
+                    say(f"fieldcal simulate: {ENDED}", err=True)
+                    return 1
             say(f"{results} results sent")
     except BrokenProcessPool:
         if not stop.is_set():
-            fault = "a process of the fleet ended: there is too little memory for so many gateways"
-            say(f"fieldcal simulate: {fault}", err=True)
+            say(f"fieldcal simulate: {ENDED}", err=True)
             return 1
     except (EndpointError, KeyFileError, OSError) as error:
         say(f"fieldcal simulate: {error}", err=True)
