@@ -22,6 +22,7 @@ import pytest
 from click.testing import CliRunner
 
 from agent.cli.simulate import simulate
+from agent.cli.simulate_fleet import ENDED
 from agent.config.known_keys import add_key
 from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, StatusChange
 from agent.delivery.consumer import Consumer, Received
@@ -206,20 +207,38 @@ def test_the_odd_gateways_are_drawn_by_the_seed() -> None:
     assert behaviours(1, 1) == ["drifting"]
 
 
-@pytest.mark.slow
-def test_ctrl_c_ends_the_command_in_order(site: Site, tmp_path: Path) -> None:
+def fleet_command(site: Site, directory: Path, *options: str) -> subprocess.Popen[str]:
+    """The command with five gateways, when they are on the bus."""
     told = [sys.executable, "-c", COMMAND, "simulate", "--fleet", "5", "--sensors", "1", "--every", "0.2",
-            "--connect", site.endpoint, "--keys", str(tmp_path / "known")]  # fmt: skip
-    environment = {"TMPDIR": str(tmp_path), "PATH": "/usr/bin:/bin"}
+            "--connect", site.endpoint, *options]  # fmt: skip
+    environment = {"TMPDIR": str(directory), "PATH": "/usr/bin:/bin"}
     process = subprocess.Popen(told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stdout is not None
     assert process.stdout.readline() == f"5 gateways with 1 sensors each at {site.endpoint}, seed 1\n"
+    return process
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_command_in_order(site: Site, tmp_path: Path) -> None:
+    process = fleet_command(site, tmp_path, "--keys", str(tmp_path / "known"))
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=20)
     assert (process.returncode, err) == (0, "")
     assert out.endswith("results sent\n")
     assert [path.name for path in tmp_path.iterdir()] == ["known"]
     assert (tmp_path / "known").read_text().count("gateway simulated/gw") == 5
+
+
+@pytest.mark.slow
+def test_the_command_tells_that_a_process_has_ended(site: Site, tmp_path: Path) -> None:
+    process = fleet_command(site, tmp_path)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    of_fleet = [int(pid) for pid in children if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    os.kill(of_fleet[0], signal.SIGKILL)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert err == f"fieldcal simulate: {ENDED}\n"
+    assert "results sent" not in out
 
 
 def test_options_that_do_not_belong_together() -> None:
