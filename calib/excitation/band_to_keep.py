@@ -37,7 +37,8 @@ def band_to_keep(
     """
     rate_hz, derivatives, m = rates_hz[0], instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
-    density = np.maximum(density, instrument.noise / np.sqrt(0.5 * rate_hz))
+    stated = instrument.noise / np.sqrt(0.5 * rate_hz)
+    density = np.maximum(density, stated)
     if derivatives:
         widest_hz = np.minimum(DIFFERENTIATED_BAND_HZ, widest_hz)
     unlimited = noise_in_bands(instrument.known.noise(float(widest_hz[0]), rate_hz) * density, widest_hz, derivatives)
@@ -47,7 +48,7 @@ def band_to_keep(
     if noisy and found_hz is not None and len(together):
         beyond_hz = found_hz, BAND * min(rates_hz)
         moves = moving_share(together[:, 3:], together[:, :3], rates_hz[1], beyond_hz, derivatives)
-        density = np.maximum(density * np.sqrt(1.0 - moves), instrument.noise / np.sqrt(0.5 * rate_hz))
+        density = np.maximum(density * np.sqrt(1.0 - moves), stated)
     ends_hz = [found_hz if noisy else None, _limit_hz(raw, V, instrument, rates_hz, found_hz)]
     ends_hz.append(None if to_hz is None else to_hz / STOP_BAND)
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)

@@ -148,8 +148,8 @@ def correlated_lag(
     for time_s, V, u in islice((piece for part in parts for piece in _pieces(*part)), 0, None, every):
         step_s = step_s or float(median(np.diff(time_s))) / FINER
         middles.append(0.5 * (time_s[0] + time_s[-1]))
-        size = int(np.ceil(reach_s / step_s)) + 1
-        correlations.append(_correlation(V, u, size, SLOWEST * omega * step_s * FINER / (2.0 * np.pi)))
+        slowest = SLOWEST * omega / (2.0 * np.pi) * FINER * step_s
+        correlations.append(_correlation(V, u, int(np.ceil(reach_s / step_s)) + 1, slowest))
     if not middles:
         return None
     middles_s = np.array(middles)
