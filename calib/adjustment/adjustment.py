@@ -13,6 +13,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from calib.adjustment.across import Across, across_of
 from calib.adjustment.budget import Budget, budget
 from calib.adjustment.equations import Equations
 from calib.adjustment.slope_scatter import SlopeScatter, estimated
@@ -25,17 +26,13 @@ from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import KnownResponses, ResponseTold, response_at_one_frequency, response_of
 from calib.model import Array, Calibration, Window
-from calib.windows.banded import Factors
-from calib.windows.bands import LEAST_SHARE, motion_band_hz
+from calib.windows.bands import motion_band_hz
 from calib.windows.condense import Condensed, condense, effective
-from calib.windows.excited import Excitation, excited_together
+from calib.windows.excited import excited_together
 from calib.windows.never_turned import mean_input, never_turned
 
 SCATTER_TURNS = 3  # the first solution is bent by what it takes for exact; the estimate settles in two
 SCATTER_SETTLED = 0.05
-# Noise of an axis over that of another one, as variances: of MEMS 6 at most (2.5 times the rms). Times what is stated,
-# from which the motion across a uniaxial reference that the data show counts.
-NOISIER_AXIS, MORE_ACROSS = 10.0, 2.0
 # Standard uncertainty, over the sensor's scale, of S along a direction that nothing excited, where it becomes a prior.
 # An element of which more than UNSEEN_SHARE (calib.adjustment.equations) lies along it may then be off by that scale.
 UNKNOWN = 50.0
@@ -172,25 +169,26 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     stated = priors
     if never_turned(np.array([mean_input(w) for w in used])):
         priors = _without_offset(priors)
-    found, ways = excited_together(used)
     plain = not any(priors.values.values())  # with every nuisance fixed it is Method 3: all points weigh the same
+    found, ways = excited_together(used)
+    across = Across() if plain else across_of(found, priors.transverse)
+    if across.output is not None:  # what is left does not feel it
+        found, ways = excited_together(across.taken_out(used))
+        priors = priors.with_values({"transverse": 0.0})
+    elif across.motion:
+        priors = priors.with_values({"transverse": across.motion})
     model = priors.response_model
     to_hz, one = np.inf if model.one_frequency else model.to_hz, model.one_frequency
     data = condense(found, alike=plain, response_hz=to_hz, one_frequency=one, powers=model.powers)
-    across = 0.0 if plain else _motion_across(found)
-    if across <= MORE_ACROSS * priors.transverse:
-        across = 0.0
-    else:
-        priors = priors.with_values({"transverse": across})
     if not plain:
-        data = effective(data, np.array([w.independent for w in used]))
+        data = replace(effective(data, np.array([w.independent for w in used])), telling=across.telling)
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
     scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
     held = [e.pose for e in found]
     equations = partial(Equations, data, held, priors, applied, ways=ways)
     first = solve(equations(scatter), priors)
     solution, scatter = _with_scatter(first, scatter, equations, priors)
-    shares = budget(solution, priors.offset_mps2, priors.known_u)
+    shares = budget(solution, priors.offset_mps2, priors.known_u, across)
     mean, covariance = solution.x[:12], shares.covariance[:12, :12]
     prior_u = _prior_u(stated, solution.equations.output_per_mps2)
     seen = solution.equations.seen | solution.bounded  # what the data do not see, they may tell by combinations
@@ -224,30 +222,8 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         covariance=shares.covariance,
         response=_response(solution, shares.covariance, priors, used, k),
         share=share_after(solution),
-        motion_across=across,
+        motion_across=across.motion,
     )
-
-
-def _motion_across(windows: Sequence[Excitation]) -> float:
-    """The rms of motion across a uniaxial reference that the sensor shows along an axis, over that of the motion. The
-    part of it that follows the motion looks like S, and is about as large.
-
-    It is what the motion leaves of the outputs in the bands that move, beyond what it leaves of the output that moves
-    most: there, noise of the reference shows as well, and a response. 0 where that is not much more in most of these
-    bands: hum and other lines are in few.
-    """
-    power = beyond = 0.0
-    for bands in (w.bands for w in windows if len(w.live) == 1 and w.live.all()):
-        if bands is None:
-            continue
-        own = Factors(bands, np.arange(len(bands.points)))
-        moved = own.told.sum(axis=1)
-        moved = np.where(moved > LEAST_SHARE * moved.max(initial=0.0), moved, 0.0)
-        power += float(moved.sum())
-        along, most = own.left[:, int(np.argmax(own.told.sum(axis=0)))], own.left.max(axis=1)
-        if moved[most > NOISIER_AXIS * along].sum() > 0.5 * moved.sum():
-            beyond += float((most - along)[moved > 0.0].sum())
-    return float(np.sqrt(beyond / power)) if power > 0.0 else 0.0
 
 
 def _response(

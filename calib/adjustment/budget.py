@@ -12,11 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.adjustment.across import Across
 from calib.adjustment.scatter import between_windows
 from calib.adjustment.solution import Solution, slope_residuals
 from calib.model import Array
 from calib.windows.banded import Banded
 from calib.windows.deviations import BetweenBands
+
+NOTHING = Across()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +41,11 @@ class Budget:
     consistency: tuple[float, float]  # chi-squared of the windows against noise and stated scatter, and its expectation
 
 
-def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float = 0.0) -> Budget:
+def budget(
+    solution: Solution, stated_offset_scatter_mps2: float, known_u: float = 0.0, across: Across = NOTHING
+) -> Budget:
     """The budget of a solution. `stated_offset_scatter_mps2` is the prior scatter of the offset between windows,
-    `known_u` relative of S: whose filter differs from what is stated."""
+    `known_u` relative of S: whose filter differs from what is stated. `across`: what was taken out of an output."""
     seen = between_windows(solution)
     noise = _type_a(solution)
     sources = {"type A": (noise, solution.equations.data.type_a.degrees_of_freedom)}
@@ -53,6 +58,9 @@ def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float
         sources["slopes between windows"] = (seen.slope.scatter**2 * seen.slope.term, seen.slope.degrees_of_freedom)
     if known_u > 0.0:
         sources["known filters"] = (_alike(solution, known_u), np.inf)
+    if across.output is not None:
+        along = slice(4 * across.output, 4 * across.output + 1)
+        sources["transverse motion, by other outputs"] = (_alike(solution, across.u, along), np.inf)
     banded = solution.equations.data.bands
     if banded is not None:
         sources |= {name: (middle, np.inf) for name, middle in _of_bands(solution, banded).items()}

@@ -189,7 +189,8 @@ class Equations:
                 own = self._pose_of == k
                 found[own, :, 12:] = by[own] @ effect
         del by_inputs  # of a day much memory
-        noise = np.tile(data.type_a.noise, 2 * data.channels)
+        # Of an output that tells nothing of S, no row has a weight.
+        noise = np.tile(np.where(data.telling, data.type_a.noise, np.inf), 2 * data.channels)
         jacobians[0] /= noise[..., None]
         white = [self.scatter.whiten(part) for part in (slope / noise, jacobians[0])]
         shape, weight = data.slopes.shape, self.mean_weight

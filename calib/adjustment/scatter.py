@@ -54,7 +54,9 @@ def between_windows(solution: Solution) -> BetweenWindows:
     offset, freedom = _excess(mean**2, mean_free, noise, unit, OFFSET_PROBABILITY)
     term = np.einsum("win,wim->nm", mean_rows * unit[..., None], mean_rows)
 
-    loading = s * data.root[:, :m, :m, None] / data.type_a.noise[:, None, None]  # (B, row, channel, axis)
+    loading = (
+        s * data.root[:, :m, :m, None] * data.telling / data.type_a.noise[:, None, None]
+    )  # (B, row, channel, axis)
     slope_unit = np.einsum("brca,brca->bra", loading, loading)
     slope_noise = np.broadcast_to(np.diag(data.type_a.slopes).reshape(-1, 3)[:m], slope_unit.shape)
     own, free = slope[:, :m] ** 2, slope_free[:, :m]

@@ -43,9 +43,10 @@ class SlopeScatter:
         """The scatter of condensed windows; `lag_s` and `attenuation` are (B,), or one number for all windows."""
         m, blocks = data.channels, len(data.slopes)
         own = regressed(data.root, data.slopes)
-        lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / data.type_a.noise[:, None]
+        noise = np.where(data.telling, data.type_a.noise, np.inf)[:, None]
+        lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / noise
         signal = np.zeros_like(data.slopes)
-        signal[:, :m] = data.slopes[:, :m] / data.type_a.noise[:, None]
+        signal[:, :m] = data.slopes[:, :m] / noise
         return SlopeScatter(
             np.broadcast_to(np.asarray(lag_s, dtype=float), blocks), lag.reshape(blocks, -1),
             np.broadcast_to(np.asarray(attenuation, dtype=float), blocks), signal.reshape(blocks, -1),

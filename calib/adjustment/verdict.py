@@ -296,7 +296,8 @@ def misfit(solution: Solution) -> float:
     equations = solution.equations
     data, noise = equations.data, equations.data.type_a.noise
     slope, mean = equations.split(solution.residual)
-    parts = [(slope * noise[:, None], data.slopes, np.broadcast_to(noise[:, None], slope.shape))]
+    told = data.slopes * data.telling
+    parts = [(slope * noise[:, None], told, np.broadcast_to(noise[:, None] * data.telling, slope.shape))]
     weight = np.where(equations.mean_weight > 0.0, equations.mean_weight, np.inf)
     root = np.sqrt(data.count)[:, None]
     held = equations.known

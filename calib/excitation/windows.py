@@ -21,13 +21,14 @@ from calib.excitation.motion_numbers import motion_numbers
 from calib.excitation.rests import find_rests
 from calib.excitation.steadiness import nonlinearity, step
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
-from calib.model import Array, BandSums, Pose, Window, WindowSums
+from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
 from calib.signal.order_statistics import median
 from calib.signal.stamps import OFF_S
 from calib.windows.bands import band_sums
 from calib.windows.sums import pool, window_sums
 
 CALM = "the reference is calm here"  # compared with the rest of the samples
+FOLLOWS = 0.3  # least share of what the motion moves, as amplitudes, that the output along it has
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
 
@@ -253,8 +254,9 @@ def _motion(
         clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
         if leave_out:
             sums = clean
-    numbers = motion_numbers(clean, basis[kept], V[kept], rate_hz, stepped, limits, noise)
-    numbers |= nonlinearity(V, residual, rate_hz)
+    way = _along(pose, V - residual)
+    numbers = motion_numbers(clean, basis[kept], V[kept] @ way, rate_hz, stepped, limits, noise)
+    numbers |= nonlinearity(V @ way, residual @ way, rate_hz)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
     numbers["clipped_points"] = float(detection.clipped(V, residual, finest))
     verdict = judge(sums, struck, numbers, limits)
@@ -264,6 +266,15 @@ def _motion(
     if not (taper and verdict.used):
         return window
     return replace(window, bands=_bands(points, struck, residual, rate_hz, taper))
+
+
+def _along(pose: Pose, moved: Array) -> Array:
+    """(3, A) the outputs that a window is judged by: all, or of a uniaxial reference the one along its motion, where
+    that is what the motion has `moved` (n, 3). The others show motion across, which nobody measures."""
+    if own_channels(pose.direction.shape[1]) != 1:
+        return np.eye(3)
+    way = pose.direction[:, :1]
+    return way if float(np.var(moved @ way)) > FOLLOWS**2 * float(np.var(moved, axis=0).sum()) else np.eye(3)
 
 
 def _bands(

@@ -8,10 +8,11 @@ the problem depends on the geometry alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array, BandSums, Pose, WindowSums, own_channels
 from calib.signal.response import POWERS
@@ -58,7 +59,8 @@ class Condensed:
 
     `root` (W, 2M, 2M) is R; `slopes` (W, 2M, 3) is R b; `omega2` (W,) in rad2/s2 is the power of du/dt over that of u;
     `mean_x` (W, 2M) and `mean_v` (W, 3) are the means of the basis and of V; `count` (W,) is the number of samples;
-    `type_a` is their noise.
+    `type_a` is their noise. `telling` (3,) flags the outputs whose slopes tell S: all, but beside a uniaxial reference
+    on a structure that moves across it (calib.adjustment.across).
     """
 
     channels: int
@@ -70,6 +72,7 @@ class Condensed:
     count: Array
     type_a: TypeA
     bands: Banded | None = None
+    telling: NDArray[np.bool_] = field(default_factory=lambda: np.ones(3, dtype=bool))
 
 
 def condense(
