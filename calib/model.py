@@ -97,6 +97,9 @@ class BandSums:
     lasting: Array
 
 
+U_NOISE = 0.1  # of white noise that a spectrum of some hundred lines shows
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """One window of known excitation: its pose, its sums, and the verdict whether it is used.
@@ -123,6 +126,7 @@ class Window:
     u_lag_s: float = 0.0
     independent: float = 1.0
     reference_noise: Array | None = None  # (2, m) rms of the reference's own noise in u, m/s2, and in du/dt, m/s3
+    u_noise: float = U_NOISE  # relative standard uncertainty of that noise as power
     bands: BandSums | None = None  # None at rest, and where no response over frequency is estimated
     response: tuple[float, ...] = ()  # terms (calib.signal.response) that were taken out; () where none were
     motion_hz: tuple[float, float] | None = None

@@ -19,7 +19,7 @@ import numpy as np
 
 from calib.estimate.axes import MOST_TRANSVERSE
 from calib.estimate.determined import Flags
-from calib.model import BandSums, Window
+from calib.model import Array, BandSums, Window
 from calib.windows.banded import Factors
 from calib.windows.bands import LEAST_SHARE
 from calib.windows.excited import Excitation
@@ -30,6 +30,7 @@ NOISIER_AXIS, MORE_ACROSS = 10.0, 2.0
 LEAST_ACROSS = 0.05  # of the motion along: with less, as on a shaker, S along is as right, and the other outputs tell S
 ALONG = 0.9995  # least cosine between the motion and an axis of the sensor: 1.8 deg
 U_TRANSVERSE = 0.03  # of a transverse sensitivity over a main one, where nobody states it. MEMS have 1 to 3 %
+QUIET = 0.25  # of the bands: there, what motion along leaves of an output across is mostly noise
 LEAST_REST = 1e-4  # of what the motion leaves of the output along, as power
 NOTHING_KNOWN = 1e3 * U_TRANSVERSE
 TINY = float(np.finfo(float).tiny)
@@ -80,25 +81,26 @@ def across_of(windows: Sequence[Excitation], stated: float) -> Across:
     if not bands:
         return Across()
     motion = _motion_across(bands)
-    found = Across(motion if motion > MORE_ACROSS * stated else 0.0)
     ways = np.array([w.pose.direction[:, 0] for w in windows if w.live.any()])
     output = int(np.argmax(np.abs(ways[0])))
     if len(alone) < len(ways) or np.abs(ways[:, output]).min() < ALONG:
-        return found
-    return replace(_taken_out_of(output, bands, max(motion, stated)), motion=found.motion)
+        return Across(motion if motion > MORE_ACROSS * stated else 0.0)
+    taken_out = _taken_out_of(output, bands, max(motion, stated))
+    motion = max(motion, taken_out.motion)
+    return replace(taken_out, motion=motion if motion > MORE_ACROSS * stated else 0.0)
 
 
 def _taken_out_of(output: int, bands: Sequence[BandSums], motion: float) -> Across:
     """`Across` of the output along, where `motion` across, or what follows the motion along, is no transverse
     sensitivity."""
-    others, left = [i for i in range(3) if i != output], np.zeros((3, 3))
+    others, left, density = [i for i in range(3) if i != output], np.zeros((3, 3)), list[Array]()
     points = freedom = along = power = 0.0
-    lowest, follows = np.full(2, np.inf), np.zeros((2, 2))
+    follows = np.zeros((2, 2))
     for own in bands:
         factors, m = Factors(own, np.arange(len(own.points))), own.reference_channels
         each = own.products[:, 2 * m :, 2 * m :] - factors.slopes.mT @ factors.slopes
         left += each.sum(axis=0)
-        lowest = np.minimum(lowest, (each[:, others, others] / own.points[:, None]).min(axis=0))
+        density.append(each[:, others, others] / own.points[:, None])
         points, freedom = points + float(own.points.sum()), freedom + float(factors.free.sum()) * own.independent
         moved = factors.slopes[..., others]
         along += float(factors.left[:, output].sum())
@@ -108,19 +110,18 @@ def _taken_out_of(output: int, bands: Sequence[BandSums], motion: float) -> Acro
     if motion < LEAST_ACROSS and float(np.trace(follows)) < MOST_TRANSVERSE**2:
         return Across()
     common, shared = left[np.ix_(others, others)], left[others, output]
-    each = np.maximum(np.diag(common), TINY)
-    white = np.clip(np.maximum(lowest, 0.0) * points / each, 0.0, 1.0)  # the share of white noise
     rest = max(along - float(shared @ np.linalg.pinv(common) @ shared), LEAST_REST * along, TINY)
-    known = (common - np.diag(white * each)) * max(freedom, 1.0) / rest
-    by_motion = np.linalg.inv(known + np.eye(2) / NOTHING_KNOWN**2)
-    # A lag or a response that changes shows in all outputs alike, as far as they follow the motion along.
-    alike = np.sqrt(np.diag(follows)) * rest / each
-    c = by_motion @ (shared * max(freedom, 1.0) / rest)
-    by_data = by_motion + np.diag(alike**2 + (c * white) ** 2)
+    quiet = points * np.quantile(np.concatenate(density), QUIET, axis=0)
+    white = np.diag(np.minimum(np.minimum(quiet, NOISIER_AXIS * rest), np.diag(common)))
+    inverse = np.linalg.inv(common + np.eye(2) * rest / NOTHING_KNOWN**2)
+    by_chance = np.linalg.inv((common - white) * max(freedom, 1.0) / rest + np.eye(2) / NOTHING_KNOWN**2)
+    # A lag or a response that changes shows in all outputs alike, as far as they follow the motion along. And white
+    # noise of the outputs across takes from c.
+    by_data = by_chance + inverse @ (rest**2 * follows + U_TRANSVERSE**2 * white @ white) @ inverse
     weight = U_TRANSVERSE**2 * np.linalg.inv(by_data + U_TRANSVERSE**2 * np.eye(2))
-    c, covariance = weight @ c, U_TRANSVERSE**2 * (np.eye(2) - weight)
+    c, covariance = weight @ inverse @ shared, U_TRANSVERSE**2 * (np.eye(2) - weight)
     u2 = float(np.sum(covariance * follows) + c @ c * U_TRANSVERSE**2)
-    return Across(0.0, output, (float(c[0]), float(c[1])), float(np.sqrt(max(u2, 0.0))))
+    return Across(float(np.sqrt(np.trace(follows))), output, (float(c[0]), float(c[1])), float(np.sqrt(max(u2, 0.0))))
 
 
 def _motion_across(bands: Sequence[BandSums]) -> float:

@@ -22,6 +22,7 @@ from calib.adjustment.verdict import misfit, nothing_determined, nuisance_pull, 
 from calib.distributions import coverage_factor
 from calib.estimate.determined import Flags, determined
 from calib.estimate.nuisances import Applied, Priors
+from calib.estimate.physics import padded
 from calib.estimate.quantities import LAG, RESPONSE, Kind
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.response_told import KnownResponses, ResponseTold, response_at_one_frequency, response_of
@@ -89,8 +90,7 @@ class Adjustment:
     `misfit`: what S a + Q leaves of the signal. `nuisance_pull`: how far the nuisances moved from what was stated, in
     standard deviations, worst direction. `mean` (N,) and `covariance` (N, N): joint state of [S, Q, nuisances], nothing
     blanked. `response`: over frequency; None where it is no unknown. `share`: what S and Q owe to the reference.
-    `motion_across`: u of the motion across a uniaxial reference, relative, where the data show much more of it than is
-    stated, and it took the place of that; else 0.
+    `across`: the motion across a uniaxial reference that the data show, and what was taken out of the output along.
     """
 
     calibration: Calibration
@@ -111,7 +111,7 @@ class Adjustment:
     covariance: Array
     response: ResponseTold | None
     share: ReferenceShare | None
-    motion_across: float
+    across: Across
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -183,7 +183,8 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
     if not plain:
         data = replace(effective(data, np.array([w.independent for w in used])), telling=across.telling)
     u_lag_s = [max(w.u_lag_s, priors.lag_window_s) if priors.lag_s > 0.0 else 0.0 for w in used]
-    scatter = SlopeScatter.of(data, u_lag_s, [e.attenuation for e in found])
+    noisy = np.array([padded(e.noise_shares.reshape(2, -1), data.channels).ravel() for e in found])
+    scatter = SlopeScatter.of(data, u_lag_s, [e.window.u_noise for e in found], noisy)
     held = [e.pose for e in found]
     equations = partial(Equations, data, held, priors, applied, ways=ways)
     first = solve(equations(scatter), priors)
@@ -222,7 +223,7 @@ def adjust(windows: Sequence[Window], priors: Priors | None = None, applied: App
         covariance=shares.covariance,
         response=_response(solution, shares.covariance, priors, used, k),
         share=share_after(solution),
-        motion_across=across.motion,
+        across=across,
     )
 
 

@@ -21,6 +21,7 @@ from calib.model import Array
 from calib.windows.condense import Condensed, regressed
 
 PROBABILITY = 0.99  # confidence of the test for scatter: noise alone passes it once in a hundred recordings
+LEAST_ROOT = 1e-6  # relative: a direction that moves less was not excited
 LEAST_FREEDOM = 0.5  # with fewer degrees of freedom the residuals are only rounding errors
 
 
@@ -28,34 +29,44 @@ LEAST_FREEDOM = 0.5  # with fewer degrees of freedom the residuals are only roun
 class SlopeScatter:
     """Scatter of the slopes of B windows. A loading (B, 6M) is the derivative of the slopes, whitened by the noise.
 
-    `lag_s` (B,) is the SD of a window's own lag, `lag` its loading; `attenuation` (B,) is the relative SD that the
-    noise correction leaves, `signal` its loading. `degrees_of_freedom` of the lag's scatter: inf if it was stated.
+    `lag_s` (B,) is the SD of a window's own lag, `lag` its loading; `u_noise` (B,) is the relative SD of the power of
+    the reference's noise, which was subtracted, `corrected` its loading. `degrees_of_freedom` of the lag's scatter: inf
+    if it was stated.
     """
 
     lag_s: Array
     lag: Array
-    attenuation: Array
-    signal: Array
+    u_noise: Array
+    corrected: Array
     degrees_of_freedom: float = np.inf
 
     @staticmethod
-    def of(data: Condensed, lag_s: ArrayLike = 0.0, attenuation: ArrayLike = 0.0) -> SlopeScatter:
-        """The scatter of condensed windows; `lag_s` and `attenuation` are (B,), or one number for all windows."""
+    def of(
+        data: Condensed, lag_s: ArrayLike = 0.0, u_noise: ArrayLike = 0.0, shares: Array | None = None
+    ) -> SlopeScatter:
+        """The scatter of condensed windows; `lag_s` and `u_noise` are (B,), or one number for all windows. `shares`
+        (B, 2M): noise of the reference over its motion, as power; None where it has none.
+
+        With R'R = P the power of the motion, noise N of which the share d was not subtracted takes P^-1 N b d from the
+        slopes b: most where the motion is weakest.
+        """
         m, blocks = data.channels, len(data.slopes)
         own = regressed(data.root, data.slopes)
         noise = np.where(data.telling, data.type_a.noise, np.inf)[:, None]
         lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / noise
-        signal = np.zeros_like(data.slopes)
-        signal[:, :m] = data.slopes[:, :m] / noise
+        corrected = np.zeros_like(data.slopes)
+        if shares is not None:
+            power = np.sum(data.root**2, axis=1) * shares
+            corrected = np.linalg.pinv(data.root.mT, rcond=LEAST_ROOT) @ (power[..., None] * own) / noise
         return SlopeScatter(
             np.broadcast_to(np.asarray(lag_s, dtype=float), blocks), lag.reshape(blocks, -1),
-            np.broadcast_to(np.asarray(attenuation, dtype=float), blocks), signal.reshape(blocks, -1),
+            np.broadcast_to(np.asarray(u_noise, dtype=float), blocks), corrected.reshape(blocks, -1),
         )  # fmt: skip
 
     @property
     def loaded(self) -> Array:
         """(B, 2, 6M) both loadings, each multiplied by its SD."""
-        return np.stack([self.lag_s[:, None] * self.lag, self.attenuation[:, None] * self.signal], axis=1)
+        return np.stack([self.lag_s[:, None] * self.lag, self.u_noise[:, None] * self.corrected], axis=1)
 
     def covariance(self) -> Array:
         """(B, 6M, 6M) covariance of the whitened slopes due to the scatter, without their noise."""
@@ -64,7 +75,7 @@ class SlopeScatter:
 
     def whiten(self, rows: Array) -> Array:
         """Slope rows (B, 6M, ...) multiplied by (1 + covariance)^-1/2."""
-        if not (self.lag_s.any() or self.attenuation.any()):
+        if not (self.lag_s.any() or self.u_noise.any()):
             return rows
         less, ways = _less(self)
         along = np.einsum("bkd,bd...->bk...", ways, rows)
@@ -80,7 +91,7 @@ class SlopeScatter:
         parts = np.einsum("bdk,bdn->kbn", loaded, rows)
         if self.lag_s.any():
             found["lag between windows"] = parts[0].T @ parts[0], self.degrees_of_freedom
-        if self.attenuation.any():
+        if self.u_noise.any() and self.corrected.any():
             found["correction for the reference's noise"] = parts[1].T @ parts[1], np.inf
         return found
 

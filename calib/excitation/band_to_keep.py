@@ -6,8 +6,8 @@ import numpy as np
 
 from calib.excitation.detection import moving_share
 from calib.excitation.turning import feels_gravity
-from calib.model import Array
-from calib.signal.band import STOP_BAND, band_above_noise, noise_in_bands, power_share_above
+from calib.model import U_NOISE, Array
+from calib.signal.band import STOP_BAND, band_above_noise, noise_in_bands, power_share_above, quietest
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import BAND, DIFFERENTIATED_BAND_HZ, differentiated_band_hz
 
@@ -28,12 +28,14 @@ def band_to_keep(
     widest_hz: Array,
     to_hz: float | None,
     together: Array,
-) -> tuple[float | None, Array]:
-    """Where to limit both signals, None where that gains nothing, and the reference's noise (2, m) in what is left.
+) -> tuple[float | None, Array, float]:
+    """Where to limit both signals, None where that gains nothing; the reference's noise (2, m) in what is left, and the
+    relative standard uncertainty of its power.
 
     `rates_hz`: of the reference and of the sensor. `widest_hz` (2,): the bands of the noise in u and du/dt that
     interpolation leaves (calib.signal.resampling.Resampled). `to_hz` as in Settings. `together` (k, 3 + m): V and u at
-    the same times. What looks like white noise of the reference, and the sensor shows as well, is motion.
+    the same times. What looks like white noise of the reference, and the sensor shows as well, is motion. Where motion
+    fills the spectrum, the noise is between none and all that is left where it moves least.
     """
     rate_hz, derivatives, m = rates_hz[0], instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
@@ -49,13 +51,20 @@ def band_to_keep(
         beyond_hz = found_hz, BAND * min(rates_hz)
         moves = moving_share(together[:, 3:], together[:, :3], rates_hz[1], beyond_hz, derivatives)
         density = np.maximum(density * np.sqrt(1.0 - moves), stated)
+    u_noise = U_NOISE
+    if found_hz is None and not stated:
+        density, u_noise = quietest(raw, rate_hz) / np.sqrt(2.0), 1.0 / np.sqrt(3.0)
+        unlimited = noise_in_bands(
+            instrument.known.noise(float(widest_hz[0]), rate_hz) * density, widest_hz, derivatives
+        )
     ends_hz = [found_hz if noisy else None, _limit_hz(raw, V, instrument, rates_hz, found_hz)]
     ends_hz.append(None if to_hz is None else to_hz / STOP_BAND)
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
     if band_hz is None:
-        return None, unlimited.reshape(2, m)
+        return None, unlimited.reshape(2, m), u_noise
     noise_hz = np.minimum(FILTER_BAND * band_hz, widest_hz)
-    return band_hz, noise_in_bands(instrument.known.noise(float(noise_hz[0]), rate_hz) * density, noise_hz, derivatives)
+    noise = noise_in_bands(instrument.known.noise(float(noise_hz[0]), rate_hz) * density, noise_hz, derivatives)
+    return band_hz, noise, u_noise
 
 
 def _limit_hz(

@@ -23,7 +23,7 @@ from calib.excitation.sustained import sustained_hz
 from calib.excitation.turning import feels_gravity, is_turned, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, disproportionate
 from calib.excitation.windows import CALM, Points, at_rest, motion_windows, rest_window, still_window
-from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
+from calib.model import U_NOISE, Array, BandSums, Pose, Window, WindowSums, own_channels
 from calib.signal.band import band_above_noise, lowpass, without_short_holes, without_slow
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
@@ -84,15 +84,16 @@ DEFAULT_SETTINGS = Settings()
 class Aligned:
     """The sensor's samples with the reference at their times, in the band of the motion, and the noise of both.
 
-    `reference_noise` (2, m) as in calib.model.Window; `sensor_noise` (3,) is the rms of V's white noise in all
-    frequencies together, 0 where none shows it alone. `clipped_points`: samples at the end of the sensor's range,
-    counted before the filter, which hides them. `independent`: the share of the points that the filter leaves
+    `reference_noise` (2, m) and `u_noise` as in calib.model.Window; `sensor_noise` (3,) is the rms of V's white noise
+    in all frequencies together, 0 where none shows it alone. `clipped_points`: samples at the end of the sensor's
+    range, counted before the filter, which hides them. `independent`: the share of the points that the filter leaves
     independent; filled samples are none. `band_hz`: where the filter ends, None where there is none. `filled`: how many
     samples of a device were missing and filled, by the name that this number has in a window; empty where none was.
     """
 
     points: Points
     reference_noise: Array
+    u_noise: float
     sensor_noise: Array
     clipped_points: int
     independent: float
@@ -185,7 +186,7 @@ def aligned(
     if hums_hz:
         columns = without_lines(columns, sensor_rate_hz, hums_hz)
     rates_hz, together = (rate_hz, sensor_rate_hz), columns[np.isfinite(columns).all(axis=1) & inside, : 3 + m]
-    band_hz, noise = band_to_keep(raw, u, V, instrument, rates_hz, noise_hz, settings.to_hz, together)
+    band_hz, noise, u_noise = band_to_keep(raw, u, V, instrument, rates_hz, noise_hz, settings.to_hz, together)
     clipped, independent, unfiltered = 0, 1.0, as_measured.columns if struck.any() else columns
     if band_hz is not None and settings.limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
@@ -214,11 +215,15 @@ def aligned(
     kept = as_slice(np.flatnonzero(usable))
     V_kept, u_kept, du_kept = np.split(columns.T[:, kept].T, [3, (3 + columns.shape[1]) // 2], axis=1)
     points = Points(time_s[kept], V_kept, u_kept, du_kept, struck[kept] if struck.any() else None)
+    if u_noise > U_NOISE and not settings.limit_band:  # Method 3 as printed
+        noise = np.zeros_like(noise)
     noise = noise if against is None else against.reference_noise
     noise = not_more_than_incoherent(noise, points.u[:, :m], points.V, sensor_rate_hz)
     told = {name: float(count) for name, count in counts.items() if count}
     sensor_noise = np.sqrt(0.5 * sensor_rate_hz) * band_above_noise(V, sensor_rate_hz)[1]
-    return Aligned(points, noise, sensor_noise, clipped, independent, band_hz if settings.limit_band else None, told)
+    return Aligned(
+        points, noise, u_noise, sensor_noise, clipped, independent, band_hz if settings.limit_band else None, told
+    )  # fmt: skip
 
 
 class _Beside(NamedTuple):
@@ -396,7 +401,7 @@ def _with_numbers(window: Window, found: Aligned) -> Window:
     window = replace(window, independent=found.independent, numbers={**window.numbers, **found.filled})
     if window.kind == "rest":
         return window
-    window = replace(window, reference_noise=found.reference_noise)
+    window = replace(window, reference_noise=found.reference_noise, u_noise=found.u_noise)
     points, least = found.independent * window.points, float(DEFAULT_LIMITS.least_points)
     if window.used and points < least:
         # A regression on hardly more points than it has unknowns leaves no residual to judge it by.

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from calib.adjustment.across import Across
 from calib.adjustment.adjustment import Adjustment, adjust
 from calib.adjustment.norm_fit import norm_fit
 from calib.adjustment.response_by_band import response_by_band
@@ -17,7 +18,7 @@ from calib.estimate.quantities import RESPONSE
 from calib.estimate.response_told import LEFT_U, ResponseTold
 from calib.excitation.lag_search import largest_omega, without_lag
 from calib.excitation.windows import rests_anywhere
-from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.geometry import AXES, STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array, Window
 from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.measurement_result import NuisanceValue
@@ -86,8 +87,8 @@ def adjusted(
     outcome, found = _at_rest(told, priors)
     outcome = _with_remedy(outcome, tables, priors)
     outcome = replace(outcome, more={**outcome.more, "band_hz": band_hz})
-    if found is not None and found.motion_across:
-        outcome = replace(outcome, warnings=(_across(found.motion_across, priors.transverse),))
+    if found is not None and found.across.motion:
+        outcome = replace(outcome, warnings=(_across_warning(found.across, priors.transverse),))
     if found is None or (share := found.share) is None:
         return outcome
     if certificate is not None:
@@ -96,7 +97,14 @@ def adjusted(
     return replace(outcome, more={**outcome.more, "shared_errors": [share.as_object(*identity)]})
 
 
-def _across(seen: float, stated: float) -> str:
+def _across_warning(across: Across, stated: float) -> str:
+    seen = across.motion
+    if across.output is not None:
+        return (
+            f"the sensor shows motion across the uniaxial reference, some {100.0 * seen:.2g} % of what it measures; "
+            f"what the other outputs show of it was taken out of output {AXES[across.output]}, and u of its S contains "
+            f"{100.0 * across.u:.2g} % for what is left. Nothing tells S of the others: use a tri-axial reference"
+        )
     return (
         f"the sensor shows motion across the uniaxial reference, some {100.0 * seen:.2g} % of what it measures, or "
         f"one axis has much more noise than another; u_transverse_motion_pct is {100.0 * stated:.2g}, and "

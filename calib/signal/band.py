@@ -23,6 +23,7 @@ MARGIN = 1.25  # the band ends a quarter above the highest line that holds motio
 FEWEST_LINES = 64  # samples in a segment
 TINY = 1e-300
 WIDEST = 0.35  # of the sampling rate: above this a filter would remove hardly any noise
+ROLLS_OFF, QUIETEST = 0.4, 0.05  # of the sampling rate; of the lines
 STOP_BAND_DB = 66.0
 STOP_BAND = 1.5  # times the band that the filter passes
 HALVED = 1.25  # times the band that the filter passes: where half of an amplitude is left
@@ -60,6 +61,19 @@ def band_above_noise(x: Array, rate_hz: float) -> tuple[float | None, Array]:
     # The first median included the lines of the motion: if they are a fifth of all, it is 8 % above the noise alone.
     floor = _floor(powers[:, int(np.ceil(band_hz * size / rate_hz)) : -1], segments)
     return band_hz, np.sqrt(floor / (0.5 * rate_hz * np.sum(window**2)))
+
+
+def quietest(x: Array, rate_hz: float) -> Array:
+    """(m,) the amplitude density of x (n, m) where it is quietest: its white noise is no more than that. In the unit of
+    x per root Hz; 0 if x is too short. Above ROLLS_OFF of the rate, the filters of most devices begin."""
+    size = min(int(SEGMENT_S * rate_hz), len(x) // LEAST_SEGMENTS)
+    if size < FEWEST_LINES:
+        return np.zeros(x.shape[1])
+    powers, segments = _spectra(_bridged(x), size)
+    lines = powers[:, 1 : int(ROLLS_OFF * size)]
+    smooth = np.array([np.convolve(own, np.ones(SMOOTHED) / SMOOTHED, "valid") for own in lines])
+    floor = np.quantile(smooth, QUIETEST, axis=1) if segments else np.zeros(x.shape[1])
+    return np.sqrt(floor / (0.5 * rate_hz * np.sum(hanning(size) ** 2)))
 
 
 def power_share_above(x: Array, rate_hz: float, from_hz: float) -> float:

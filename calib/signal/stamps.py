@@ -37,6 +37,7 @@ OFF_S = 3.0
 LONG_STEPS = 10.0  # times the usual step between bursts, besides: of a slow device that step may be longer than OFF_S
 # Two of a kind differ by some per cent; a device whose rate was set anew has another filter as well.
 MOST_CHANGE = 0.1
+MIDDLE = 0.2, 0.6  # of the steps of a span, from the shortest on: those that count
 AROUND, LEAST_OF = 15, 3  # spans, and which of their periods counts: some of them hold a gap, and a few a late burst
 
 
@@ -103,9 +104,11 @@ def change_of_rate(stamp_s: Slices) -> tuple[int, float, float] | None:
         if kind == "bursts":
             periods.append(np.diff(t[: whole + 1 : size]) / size)
         else:
+            # Not the median: of 400 Hz in stamps of whole ms, steps of 2 and 3 ms take turns in being that. The longest
+            # ones are where samples are missing.
             steps = np.sort(np.diff(t[: whole + 1]).reshape(-1, size), axis=1)
-            # Not the median: of 400 Hz in stamps of whole ms, steps of 2 and 3 ms take turns in being that.
-            periods.append(steps[:, size // 4 : size - size // 4].mean(axis=1))
+            low, high = np.floor(np.multiply(MIDDLE, size)).astype(int)
+            periods.append(steps[:, low : max(high, low + 1)].mean(axis=1))
     found = np.concatenate(periods)
     if len(found) < 2 * AROUND:
         return None

@@ -35,7 +35,7 @@ HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is 
 LEAKED = 1.0  # of the power of a band, that may be of motion at other frequencies: with more, it shows their response
 NEAR_LINES = 3  # around a line that it has itself: the main lobe of a taper
 LEAST_LEAK = 1e-12  # of a line's power, in another one: what is less is beyond the numbers
-ALIKE = 0.3  # least cosine of the angle between the slopes of V and the motion, as if the outputs were the axes
+ALIKE = 0.8  # least cosine of the angle between the slopes of V and the motion, as if the outputs were the axes
 LASTS = 0.25  # of its mean power that a band has for half of the time: with less, its motion comes and goes
 BELOW, ABOVE = 1e-2, 1e-3  # shares of the motion's power outside its band: a response differs more above than below
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
+from calib.model import U_NOISE, Array, BandSums, Pose, Window, WindowSums, own_channels
 from calib.windows.bands import without_noise
 
 # Least power of an excited channel, relative to its noise. Noise reduces the slopes; the correction for it leaves a
@@ -31,8 +31,7 @@ ROUNDING = 1e-12  # of a channel's power, what is left may be a rounding error
 MOST_NOISE = 0.5  # largest part of a segment's power that the correction may subtract
 SAME_RAD = 1e-5  # stated directions that differ by less are one
 AXES = "xyz"
-CORRECTION_SHARE = 0.1  # relative standard uncertainty of the noise's power, from a spectrum of some hundred lines
-NOISE_LEFT = 3.0 * CORRECTION_SHARE  # of the noise's power, what the correction may leave: three of these
+NOISE_LEFT = 3.0 * U_NOISE  # of the noise's power, what the correction may leave: three of these
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,6 +72,17 @@ class Excitation:
         is known to it. Zeros at rest."""
         silent = ~self.live if self.live.any() else np.zeros_like(self.live)
         return np.asarray(self.window.pose.direction[:, : len(silent)][:, silent] ** 2 @ self.noise[0][silent])
+
+    @property
+    def noise_shares(self) -> Array:
+        """(2M,) noise over motion, as power, of each channel of the sums and of its derivative; 0 where none counts."""
+        m, channels = len(self.live), self.window.sums.reference_channels
+        found, at = np.zeros(2 * channels), np.r_[0:m, channels : channels + m]
+        clean = np.diagonal(_power(self.window, between=True)) - self.noise.ravel()
+        found[at] = np.divide(
+            self.noise.ravel(), clean, out=np.zeros(2 * m), where=np.tile(self.live, 2) & (clean > 0.0)
+        )
+        return found
 
     @property
     def sums(self) -> WindowSums:
@@ -229,7 +239,7 @@ def excited(window: Window, most: int = 3) -> Excitation:
     turned = direction + direction @ np.where(askew[:, None], along, 0.0)
     basis, _ = np.linalg.qr(turned[:, np.flatnonzero(live)])
     pose = window.pose if live.all() else _shared_in(window.pose, live, along, ahead)
-    return Excitation(window, pose, basis, CORRECTION_SHARE * share, live, noise, bool(askew.any()))
+    return Excitation(window, pose, basis, window.u_noise * share, live, noise, bool(askew.any()))
 
 
 def _columns(live: NDArray[np.bool_], channels: int) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -97,6 +98,40 @@ def test_calibrate_counts_the_motion_across_that_the_sensor_shows(across: float)
         assert known[8]
         assert np.abs(error).max() < 3.5, seed
         assert any("across" in warning for warning in told.warnings) == (across > 0.0), seed
+
+
+def beside_one_axis(u: Array, V: Array) -> Any:
+    time_s = np.arange(len(u)) / RATE_HZ
+    poses = [{"start_s": 1.0, "stop_s": SECONDS - 1.0, "dx": 0.0, "dy": 0.0, "dz": 1.0}]
+    return calibrate((time_s, V), {"time_s": time_s, "a": u[:, 0]}, poses=poses, reference_coupling="dc")
+
+
+@pytest.mark.parametrize("across", [0.5, 1.5])
+def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(across: float) -> None:
+    """What it moves across follows what it moves along differently in each octave, by its modes. S is off by 3 % in
+    each element: uncorrected, 1.5 times that would be in S_zz. 6 recordings of two minutes."""
+    for seed in range(6):
+        S = np.eye(3) + 0.03 * np.random.default_rng([seed, 1]).standard_normal((3, 3))
+        u, _, V = moved(seed, across, 0.01, S, np.array([0.0, 0.0, 1.0]))
+        told = beside_one_axis(u, V)
+        assert told.status == "valid", told.reasons
+        assert list(np.flatnonzero(told.determined.ravel()[:9])) == [8]
+        assert told.standard_uncertainty[8] < 0.005
+        assert abs(told.sensitivity[2, 2] - S[2, 2]) < 3.5 * told.standard_uncertainty[8], seed
+        assert "was taken out of output z" in told.warnings[0]
+
+
+def test_one_mode_alone_tells_s_along_only_as_well_as_transverse_sensitivities_are_known() -> None:
+    """x moves half as much as z, and only with it: V_z shows S_zz + 0.5 S_zx."""
+    for seed in range(6):
+        random = np.random.default_rng([seed, 2])
+        S = np.eye(3) + 0.03 * random.standard_normal((3, 3))
+        u, _, _ = moved(seed, 0.0, 0.0, S, np.array([0.0, 0.0, 1.0]))
+        V = u * [0.5, 0.0, 1.0] @ S.T + 0.01 * random.standard_normal((len(u), 3))
+        told = beside_one_axis(u, V)
+        assert told.status == "valid", told.reasons
+        assert 0.01 < told.standard_uncertainty[8] < 0.03
+        assert abs(told.sensitivity[2, 2] - S[2, 2]) < 3.0 * told.standard_uncertainty[8], seed
 
 
 def hours(transverse_pct: float) -> House:

@@ -10,7 +10,7 @@ import pytest
 import calib
 from calib.recorded.errors import InputError
 from calib.recorded.streams import TableStream
-from calib.signal.stamps import clock_from_stamps, kind_of
+from calib.signal.stamps import change_of_rate, clock_from_stamps, kind_of
 from tests.stays import Array, errors, in_batches, main_errors_pct, stays
 
 RATE_HZ = 1003.3
@@ -109,6 +109,16 @@ def test_two_rates_in_one_file_are_told(after: float, off_s: float) -> None:
         calib.calibrate((t, np.zeros((len(t), 3))), {"time_s": t, "a": np.zeros(len(t))}, [])
     assert told.value.row is not None
     assert abs(told.value.row - 6000) <= 200
+
+
+def test_stamps_of_whole_milliseconds_are_no_other_rate() -> None:
+    """At 400 Hz they are 2 or 3 ms apart, with jitter as often the one as the other: 40 files of 100 s."""
+    random = np.random.default_rng(4)
+    for jitter_s in (0.0, 0.2e-3, 0.5e-3, 1e-3):
+        for ppm in np.linspace(-60.0, 60.0, 10):
+            exact = np.arange(40_000) / 400.0 * (1.0 + 1e-6 * ppm)
+            stamp_s = np.maximum.accumulate(np.round(exact + jitter_s * random.standard_normal(len(exact)), 3))
+            assert change_of_rate(stamp_s) is None, (jitter_s, ppm)
 
 
 @pytest.mark.slow

@@ -100,14 +100,15 @@ def test_weighed_as_exact_they_would_not_be(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_loadings_are_the_size_of_motion_and_its_rate_over_the_noise() -> None:
-    """The mean square of the motion is 2^2 / 2 for each tone, that of its rate omega^2 times as much. The slopes grow
-    in proportion to the motion that is shown; a lag takes so much of them from the slope on the rate."""
+    """The mean square of the motion is 2^2 / 2 for each tone, that of its rate omega^2 times as much. Noise of
+    4 % of the power of the motion takes 4 % of what the motion shows; a lag takes so much of them from the slope on the rate."""
     own = windows(np.random.default_rng(SEED), 0.0)
     data = condense([excited(w) for w in own])
-    found, shown = SlopeScatter.of(data), np.array([w.pose.direction[:, 0] @ S_TRUE.T for w in own])
+    noisy = np.tile([0.04, 0.0], (len(own), 1))
+    found, shown = SlopeScatter.of(data, shares=noisy), np.array([w.pose.direction[:, 0] @ S_TRUE.T for w in own])
     size = np.sqrt(RATE_HZ * SECONDS * 2.0 * np.array([4.0, np.sum((2.0 * np.pi * FREQUENCIES_HZ) ** 2)]))
-    signal, lag = (loading.reshape(len(own), 2, 3) for loading in (found.signal, found.lag))
-    np.testing.assert_allclose(signal[:, 0] * data.type_a.noise / size[0], shown, rtol=0, atol=0.1)
+    corrected, lag = (loading.reshape(len(own), 2, 3) for loading in (found.corrected, found.lag))
+    np.testing.assert_allclose(corrected[:, 0] * data.type_a.noise / size[0], 0.04 * shown, rtol=0, atol=0.004)
     np.testing.assert_allclose(lag[:, 1] * data.type_a.noise / size[1], -shown, rtol=0, atol=0.1)
 
 
