@@ -28,6 +28,7 @@ _WAYS = {
     "lag between windows": "longer windows, or one clock for both devices",
     "correction for the reference's noise": "stronger motion, or a reference with less noise",
     "slopes between windows": "more windows, or a mount that does not slip",
+    "transverse motion, by other outputs": "motion in more modes, or a tri-axial reference",
     "whose noise it is": "stronger motion, or a reference with less noise",
     "known filters": "a smaller u in `sensor_filter`, `reference_filter`",
     "response between bands": _FILTERS,

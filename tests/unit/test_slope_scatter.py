@@ -101,7 +101,8 @@ def test_weighed_as_exact_they_would_not_be(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_loadings_are_the_size_of_motion_and_its_rate_over_the_noise() -> None:
     """The mean square of the motion is 2^2 / 2 for each tone, that of its rate omega^2 times as much. Noise of
-    4 % of the power of the motion takes 4 % of what the motion shows; a lag takes so much of them from the slope on the rate."""
+    4 % of the power of the motion takes 4 % of what the motion shows; a lag takes so much of them from the slope on the
+    rate."""
     own = windows(np.random.default_rng(SEED), 0.0)
     data = condense([excited(w) for w in own])
     noisy = np.tile([0.04, 0.0], (len(own), 1))
