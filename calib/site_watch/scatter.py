@@ -17,14 +17,26 @@ from calib.model import Array
 
 LAGS_DAYS = (1, 7, 28)
 PRIOR_BLOCKS = 5.0  # by which a sensor's own inflation is drawn to the median of all
+FEWEST_BLOCKS = 6.0  # that a memory holds, of the longest lag too
 CLIP = 4.0  # standard deviations of a residual or block
 
 
 class Blocks:
-    """Sums of standardised residuals over blocks of `lags` days; `shape`: of what is summed, sensors first."""
+    """Sums of standardised residuals over blocks of `lags` days; `shape`: of what is summed, sensors first.
 
-    def __init__(self, shape: tuple[int, ...], lags: tuple[int, ...] = LAGS_DAYS) -> None:
-        self.lags = lags
+    `memory_days`: time constant with which blocks are forgotten, or FEWEST_BLOCKS of them where these are longer;
+    `prior_blocks`: by which a sensor's own inflation is drawn to the median of all.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        lags: tuple[int, ...] = LAGS_DAYS,
+        memory_days: float = np.inf,
+        prior_blocks: float = PRIOR_BLOCKS,
+    ) -> None:
+        self.lags, self.prior_blocks = lags, prior_blocks
+        self.keep = [float(np.exp(-1.0 / max(memory_days, FEWEST_BLOCKS * lag))) for lag in lags]
         self.sums, self.days, self.squares, self.count = (np.zeros((len(lags), *shape)) for _ in range(4))
         self.past: dict[int, tuple[Array, Array]] = {}
 
@@ -35,8 +47,8 @@ class Blocks:
             self.days[k] += there
             full = self.days[k] >= lag
             block = np.clip(self.sums[k], -CLIP * lag**0.5, CLIP * lag**0.5)
-            self.squares[k] += np.where(full, block**2 / lag, 0.0)
-            self.count[k] += full
+            self.squares[k] = self.keep[k] * self.squares[k] + np.where(full, block**2 / lag, 0.0)
+            self.count[k] = self.keep[k] * self.count[k] + full
             self.sums[k][full] = self.days[k][full] = 0.0
 
     def inflation(self) -> Array:
@@ -60,14 +72,14 @@ class Blocks:
     def over(self, today: int, begins: list[int]) -> Array:
         """Inflation of the means from these days until today, (k, n, ...), by the longest lag that is not longer.
 
-        A sensor's own, as it was before the begin, drawn to the median of all as by PRIOR_BLOCKS blocks.
+        A sensor's own, as it was before the begin, drawn to the median of all as by `prior_blocks`.
         """
         middle = self.inflation()
         told = []
         for begin in begins:
             k = int(np.searchsorted(self.lags, today - begin + 1, side="right")) - 1
             squares, count = (part[k] for part in self.past[begin])
-            told.append((squares + PRIOR_BLOCKS * middle[k]) / (count + PRIOR_BLOCKS))
+            told.append((squares + self.prior_blocks * middle[k]) / (count + self.prior_blocks))
         return np.asarray(np.maximum(np.array(told), 1.0))
 
     def snapshot(self) -> dict[str, Any]:
