@@ -28,10 +28,7 @@ FEWEST_DAYS = 21  # that teach the norm of a sensor
 FEWEST_SINCE = 3  # days after a step, before it is told
 WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk after a day: 0.06 % in a year
 COVERAGE = 2.0
-# Factor of u for what the norm does not fit over seasons, with a limit of so many standard deviations, and what it
-# gains by the square of the limit beyond, because tails are heavier than those of a normal distribution. From the sound
-# sites of benchmarks/site_watch.py: 1.10 for 8 sensors, 1.16 for 30, 1.45 for 200.
-MISFIT, MISFIT_FROM, MISFIT_BEYOND = 1.10, 4.55, 0.9
+APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the norm does not fit over seasons
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 FEWEST_BANDS = 3  # for bands to be called alike
 NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
@@ -127,11 +124,6 @@ def limit_of(sensors: int, gateways: int, per_year: float = FALSE_ALARMS_PER_YEA
     """Standard deviations that no sound test may exceed, with `per_year` false alarms of the whole site."""
     tests = sensors * (len(DIRECTIONS) + 1 + 3) + gateways
     return -NORMAL.inv_cdf(0.5 * per_year / (tests * LOOKS_PER_YEAR))
-
-
-def misfit_of(limit: float) -> float:
-    """The factor of u for what the norm does not fit, with this limit of the tests."""
-    return MISFIT + MISFIT_BEYOND * max(limit - MISFIT_FROM, 0.0) ** 2
 
 
 def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
@@ -242,10 +234,9 @@ def examined(watch: SiteWatch, without: NDArray[np.bool_] | None = None) -> Test
     ages = np.array([watch.day - begins[k] + 1 for k in which], dtype=float)
     before = np.minimum([begins[k] - begins[0] for k in which], LONGEST_DAYS)
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
-    misfit = misfit_of(limit_of(shape[0], len(set(watch.gateway.tolist()))))
-    inflation = misfit**2 * watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
+    inflation = watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
     joint = jointly(size, information, watch.G, inflation, walk)
-    apart = _apart(joint, watch.G, misfit)
+    apart = _apart(joint, watch.G)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
     return Tests([begins[k] for k in which], joint, apart, bands)
 
@@ -256,7 +247,7 @@ def _without(variance: Array, size: Array, information: Array, days: Array) -> A
     return np.asarray(np.maximum(variance - size**2 * information / freedom, LEAST_VARIANCE * variance))
 
 
-def _apart(joint: JointChange, G: Array, misfit: float) -> Array:
+def _apart(joint: JointChange, G: Array) -> Array:
     """How much the bands of each sensor differ from any change of its sensitivities and any turn, (k, n).
 
     What most sensors show, such as days that the norm does not fit, is taken as scatter.
@@ -274,7 +265,7 @@ def _apart(joint: JointChange, G: Array, misfit: float) -> Array:
     freedom = np.sum(info > 0.0, axis=-1) - g.shape[-1]
     f = np.maximum(freedom, 1).astype(float)
     site = median(np.where(freedom > 0, squares / f, np.nan), axis=1)
-    ratio = squares / f / (misfit * np.maximum(site, 1.0))[:, None]
+    ratio = squares / f / (APART_MISFIT * np.maximum(site, 1.0))[:, None]
     deviate = (np.cbrt(ratio) - (1.0 - 2.0 / (9.0 * f))) / np.sqrt(2.0 / (9.0 * f))
     return np.asarray(np.where(freedom > 0, deviate, -np.inf))
 
