@@ -21,7 +21,7 @@ from calib.site_watch.witnesses import supply_basis
 ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
 FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, or its residual to count
 MEMORY_DAYS = 60.0  # of the scatter of days: frost, traffic and wind make it another one in each season
-PRIOR_BLOCKS = 30.0  # by which a sensor's own scatter of days is drawn to that of all, so that its test has no wide tails
+PRIOR_BLOCKS = 30.0  # by which a sensor's own scatter of days is drawn to that of all: its test has no wide tails
 FEWEST_SENSORS = 3  # with a band, for its common level to be taken out
 CHANNELS = 6
 WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
