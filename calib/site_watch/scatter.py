@@ -51,15 +51,19 @@ class Blocks:
             self.count[k] = self.keep[k] * self.count[k] + full
             self.sums[k][full] = self.days[k][full] = 0.0
 
-    def inflation(self) -> Array:
-        """(lags, ...): variance ratio of each lag, the median over sensors; 1 where nothing is known, never less."""
-        some = self.count > 0
-        each = np.where(some, self.squares / np.where(some, self.count, 1.0), np.nan)
+    def inflation(self, squares: Array | None = None, count: Array | None = None) -> Array:
+        """(lags, ...): variance ratio of each lag, the median over sensors; 1 where nothing is known, never less.
+
+        Of today, or of the `squares` and `count` of another day.
+        """
+        squares, count = (self.squares, self.count) if squares is None or count is None else (squares, count)
+        some = count > 0
+        each = np.where(some, squares / np.where(some, count, 1.0), np.nan)
         known = some.sum(axis=1) > 0
         middle = np.ones(known.shape)
         for k in range(len(self.lags)):
             if known[k].any():
-                number = np.maximum(np.median(self.count[k], axis=0), 1.0)[known[k]]
+                number = np.maximum(np.median(count[k], axis=0), 1.0)[known[k]]
                 # The median of chi-squared over its degrees of freedom (Wilson and Hilferty).
                 middle[k][known[k]] = np.nanmedian(each[k][:, known[k]], axis=0) / (1.0 - 2.0 / (9.0 * number)) ** 3
         return np.maximum.accumulate(np.maximum(middle, 1.0), axis=0)
@@ -72,14 +76,15 @@ class Blocks:
     def over(self, today: int, begins: list[int]) -> Array:
         """Inflation of the means from these days until today, (k, n, ...), by the longest lag that is not longer.
 
-        A sensor's own, as it was before the begin, drawn to the median of all as by `prior_blocks`.
+        A sensor's own, drawn to the median of all as by `prior_blocks`; both as they were before the begin, since the
+        others differ from a sensor that changes. The median is that of today where none was known.
         """
-        middle = self.inflation()
-        told = []
+        now, told = self.inflation(), []
         for begin in begins:
             k = int(np.searchsorted(self.lags, today - begin + 1, side="right")) - 1
-            squares, count = (part[k] for part in self.past[begin])
-            told.append((squares + self.prior_blocks * middle[k]) / (count + self.prior_blocks))
+            squares, count = self.past[begin]
+            middle = np.where(count[k].max(axis=0) >= 1.0, self.inflation(squares, count)[k], now[k])
+            told.append((squares[k] + self.prior_blocks * middle) / (count[k] + self.prior_blocks))
         return np.asarray(np.maximum(np.array(told), 1.0))
 
     def snapshot(self) -> dict[str, Any]:

@@ -59,13 +59,20 @@ class JointChange:
     """For each begin (k): `size`, `u` (k, n, 7): the change in each of DIRECTIONS by itself. `rest` (k, n, B, 6):
     steps without what is common; `information` (k, n, B, 6): of these, over the variance. `statistic` (k, n, 7): the
     change over its u; of a turn the smaller one of this and the same without the band that says most, since the weak
-    axis of one band says much of a turn, and moves by itself when the loads of two modes change."""
+    axis of one band says much of a turn, and moves by itself when the loads of two modes change. `scatter` (k, 1, 7):
+    factor of u by what all sensors of the site differ by."""
 
     size: Array
     u: Array
     rest: Array
     information: Array
     statistic: Array
+    scatter: Array
+
+    @property
+    def evidence(self) -> Array:
+        """The statistic without the scatter of all sensors, which differs from begin to begin: it dates a change."""
+        return self.statistic * self.scatter
 
 
 def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: Array) -> JointChange:
@@ -82,13 +89,16 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
     alone[..., :3] = information[..., :3] * others / np.where(both > 0.0, both, 1.0)
     score, squares = scores(rest, alone, G)
     size, u = _sized(score, squares, inflation, walk)
-    u *= _scatter_of_all(size / u)
+    scatter = _scatter_of_all(size / u)
+    u *= scatter
     statistic = size / u
     apart = _without_loudest(rest, alone, G[..., 3:])
     size_apart, u_apart = _sized(*apart, inflation[..., TURNS], walk)
-    least = np.minimum(np.abs(statistic[..., TURNS]), np.sign(size[..., TURNS]) * size_apart / u_apart)
+    least = np.minimum(
+        np.abs(statistic[..., TURNS]), np.sign(size[..., TURNS]) * size_apart / u_apart / scatter[..., TURNS]
+    )
     statistic[..., TURNS] = np.sign(size[..., TURNS]) * np.maximum(least, 0.0)
-    return JointChange(size, u, rest, alone, statistic)
+    return JointChange(size, u, rest, alone, statistic, scatter)
 
 
 def _sized(score: Array, squares: Array, inflation: Array, walk: Array) -> tuple[Array, Array]:
@@ -103,13 +113,15 @@ def _scatter_of_all(statistic: Array) -> Array:
     """Factor of u (k, 1, 7), at least 1: what all sensors differ by at a begin, over what they are expected to.
 
     Of sensitivities, and of turns. A median, since most sensors have not changed; what they all show, such as a frost
-    or a storm that the norm does not fit, is scatter. Few sensors say little of it.
+    or a storm that the norm does not fit, is scatter. A sensor that changes moves all others alike, which does not
+    count. Few sensors say little of it.
     """
     factor = np.ones((len(statistic), 1, len(DIRECTIONS)))
     for own, others in ((slice(0, 3), SENSITIVITIES), (TURNS, TURNS)):
-        squares = np.square(statistic[..., own]).reshape(len(statistic), -1)
-        number = np.sum(squares > 0.0, axis=1)
-        middle = median(np.where(squares > 0.0, squares, np.nan), axis=1) / MEDIAN_SQUARE
+        z = np.where(statistic[..., own] == 0.0, np.nan, statistic[..., own])
+        squares = np.square(z - median(z, axis=1)[:, None]).reshape(len(z), -1)
+        number = np.sum(np.isfinite(squares), axis=1)
+        middle = median(squares, axis=1) / MEDIAN_SQUARE
         variance = (PRIOR_TESTS + number * middle) / (PRIOR_TESTS + number)
         factor[..., others] = np.sqrt(np.maximum(variance, 1.0))[:, None, None]
     return factor

@@ -29,6 +29,7 @@ FEWEST_SINCE = 3  # days after a step, before it is told
 WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk after a day: 0.06 % in a year
 COVERAGE = 2.0
 APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the norm does not fit over seasons
+LEAST_NOISE = 0.03  # of the amplitude of the noise, for its change to be told: a sensitivity changes the noise alike
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 FEWEST_BANDS = 3  # for bands to be called alike
 NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
@@ -274,8 +275,9 @@ def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorV
     """The verdict of one sensor by itself."""
     statistic, apart = tests.joint.statistic[:, i], tests.apart[:, i]
     direction = int(np.argmax(np.abs(statistic).max(axis=0)))
-    best, dates = tests.dated(statistic[:, direction] ** 2)
-    z = abs(float(statistic[best, direction]))
+    z = float(np.abs(statistic[:, direction]).max())
+    sure = np.abs(statistic[:, direction]) >= min(z, limit)
+    best, dates = tests.dated(np.where(sure, tests.joint.evidence[:, i, direction], 0.0) ** 2)
     if apart.max() > limit and (z <= limit or apart[best] > limit):
         worst, dates = tests.dated(np.maximum(apart, 0.0) ** 2)
         return SensorVerdict(
@@ -330,7 +332,7 @@ def _noise(watch: SiteWatch, limit: float) -> list[SensorVerdict]:
         found = SensorVerdict("noise", f"noise of {'xyz'[axis]}", factor - 1.0, expanded,
                               begin, begin, begin, float(z[k, i, axis]))  # fmt: skip
         few = student_quantile(NORMAL.cdf(limit), float(days[i, axis]) - TERMS + PRIOR_DEGREES)
-        told.append(found if found.statistic > few else NOTHING)
+        told.append(found if found.statistic > few and abs(found.size) > LEAST_NOISE else NOTHING)
     return told
 
 
@@ -347,7 +349,7 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[SensorVerdict], limi
     what = "the two gateways differ; which of them changed is not seen" if pair else "all its sensors alike"
     for g, number in enumerate(numbers.tolist()[: 1 if pair else None]):
         own = index == g
-        best, dates = tests.dated(np.square(mean[:, g] / u[:, g]))
+        best, dates = tests.dated(np.square(mean[:, g] / u[:, g] * tests.joint.scatter[:, 0, ALL]))
         z = abs(float(mean[best, g] / u[best, g]))
         alone = np.abs(tests.joint.statistic[best, own, SENSITIVITIES]).max()
         if z > max(limit, alone) and fits[best, g] and (own & alike).sum() > 1:
