@@ -22,7 +22,7 @@ from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChang
 from calib.site_watch.watch import VISIT, SiteWatch, pooled
 from calib.site_watch.witnesses import Witness, gravity, noise, self_test
 
-FALSE_ALARMS_PER_YEAR = 0.5  # of a whole site, at most, where the model of the scatter holds
+FALSE_ALARMS_PER_YEAR = 0.75  # of a whole site, at most, where the model of the scatter holds
 LOOKS_PER_YEAR = 1000.0  # independent looks of a test: a new one each day for steps of a few days, fewer for older ones
 FEWEST_DAYS = 21  # that teach the norm of a sensor
 FEWEST_SINCE = 3  # days after a step, before it is told

@@ -105,10 +105,13 @@ class SiteWatch:
     def variance(self) -> Array:
         """Variance of the channels (n, B, 6) over what their noise gives, with dependence over a week.
 
-        A channel's own, drawn to the median of all sensors in its band as by PRIOR_DEGREES days. The dependence is that
-        of all sensors in its band: the own one would grow by a step.
+        A channel's own, drawn to the median of all sensors in its band as by PRIOR_DEGREES days.
         """
-        return np.asarray(pooled(*self.steps.rest(), self.shape) * self.band_scatter.inflation()[WEEK])
+        own = pooled(*self.steps.rest(), self.shape)
+        blocks = self.band_scatter
+        enough = blocks.count[WEEK] + PRIOR_DEGREES
+        week = (blocks.squares[WEEK] + PRIOR_DEGREES * blocks.inflation()[WEEK]) / enough
+        return np.asarray(own * np.maximum(week, 1.0))
 
     def taught(self) -> float:
         """Factor of the variance of each test, at least 1, from the visits that looked at a suspicion."""
