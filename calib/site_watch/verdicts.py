@@ -22,13 +22,16 @@ from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChang
 from calib.site_watch.watch import VISIT, SiteWatch, pooled
 from calib.site_watch.witnesses import Witness, gravity, noise, self_test
 
-FALSE_ALARMS_PER_YEAR = 0.75  # of a whole site, at most, where the model of the scatter holds
+FALSE_ALARMS_PER_YEAR = 0.5  # of a whole site, at most, where the model of the scatter holds
 LOOKS_PER_YEAR = 1000.0  # independent looks of a test: a new one each day for steps of a few days, fewer for older ones
 FEWEST_DAYS = 21  # that teach the norm of a sensor
 FEWEST_SINCE = 3  # days after a step, before it is told
 WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk after a day: 0.06 % in a year
 COVERAGE = 2.0
 APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the norm does not fit over seasons
+# Part of the variance of a sensor that all of its gateway share: they are neighbours, and shapes move smoothly along a
+# structure. Assumed.
+PART_SHARED = 0.25
 LEAST_NOISE = 0.03  # of the amplitude of the noise, for its change to be told: a sensitivity changes the noise alike
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 FEWEST_BANDS = 3  # for bands to be called alike
@@ -367,10 +370,11 @@ def _means(joint: JointChange, index: NDArray[np.int64], counts: NDArray[np.bool
     member = np.eye(index.max() + 1)[index]  # (n, g)
     total = weight @ member
     mean = np.where(total > 0.0, (weight * s) @ member / np.where(total > 0.0, total, 1.0), np.nan)
-    variance = np.where(total > 0.0, 1.0 / np.where(total > 0.0, total, 1.0), np.inf)
+    shared = 1.0 + PART_SHARED * np.maximum((weight > 0.0) @ member - 1.0, 0.0)
+    variance = np.where(total > 0.0, shared / np.where(total > 0.0, total, 1.0), np.inf)
     pair = mean.shape[1] == 2
     centre = mean[:, 1] if pair else median(mean, axis=1)
-    others = variance[:, 1] if pair else np.pi / 2.0 / np.maximum(total.sum(axis=1), 1e-300)
+    others = variance[:, 1] if pair else np.pi / 2.0 / np.maximum((total / shared).sum(axis=1), 1e-300)
     away = np.abs(s - np.nan_to_num(mean) @ member.T)
     reach = np.maximum(4.0 * joint.u[:, :, ALL], 0.3 * np.abs(np.nan_to_num(mean - centre[:, None]) @ member.T))
     wrong = ((away > reach) & (weight > 0.0)) @ member
