@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
+from scipy.sparse import csr_array
 
 from calib.model import Array
 from calib.signal.spectra import LEAST_RATIO, THIRD_OCTAVE
@@ -146,7 +147,8 @@ class Bridge:
         self.grid_hz = BANDS_HZ[0] * 10.0 ** (0.1 * np.arange(-1.0, len(BANDS_HZ), GRID))
         place = 10.0 * np.log10(self.grid_hz[:, None] / BANDS_HZ)
         weight = np.maximum(1.0 - np.abs(place), 0.0) * (GRID * self.grid_hz * THIRD_OCTAVE)[:, None]
-        self.windows = np.hstack([weight, weight * place]).astype(np.float32)
+        self.windows = csr_array(np.hstack([weight, weight * place]).T)
+        self.pairs = np.triu_indices(len(FREQUENCY_HZ))
         self.strongest = np.argsort(-self.log_power[:, :, 32], axis=0)[:ACTING].T
 
     def _noise(self) -> None:
@@ -262,14 +264,18 @@ class Bridge:
         found = np.full((PER_DAY, n, 3, bands), np.nan)
         wide = np.hypot(DAMPING, LINE_HZ / FREQUENCY_HZ)  # as segments of a minute show it
         by_chance = np.sqrt(5.0 * DAMPING / (4.0 * np.pi * FREQUENCY_HZ * 3600.0))
-        square = np.square(self.grid_hz)
+        square, (one, other) = np.square(self.grid_hz), self.pairs
         for h in range(PER_DAY):
             own = (FREQUENCY_HZ * (1.0 + moved[h] + by_chance * random.standard_normal(len(wide))))[:, None]
             response = square**2 / ((own**2 - square) ** 2 + np.square(2.0 * wide[:, None] * own * self.grid_hz))
-            power = shapes**2 * load[h, self.gateway, None]  # (n, 3, modes)
-            psd = (power.reshape(3 * n, -1) @ response).astype(np.float32)
-            first = (psd @ self.windows).reshape(n, 3, 2, bands)
-            squared = (np.square(psd) @ self.windows).reshape(n, 3, 2, bands)
+            power = (shapes**2 * load[h, self.gateway, None]).reshape(3 * n, -1)  # of the modes
+            first = (power @ (self.windows @ response.T).T).reshape(n, 3, 2, bands)
+            if len(power) < len(one):
+                squared = self.windows @ np.square(power @ response).T
+            else:  # the square of a sum of modes, by the integrals of each pair of them
+                both = power[:, one] * power[:, other] * np.where(one == other, 1.0, 2.0)
+                squared = self.windows @ (response[one] * response[other]).T @ both.T
+            squared = squared.T.reshape(n, 3, 2, bands)
             noise = self.noise[..., None]
             scatter = np.square(noise) * np.sqrt(5.0 * self.width_hz / 3600.0)
             left = squared - 2.0 * floor_error[h, :, :, None, None] * first

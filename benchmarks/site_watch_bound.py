@@ -34,7 +34,7 @@ SENSORS = 8
 MARKS = {5: 0.01, 30: 0.005}  # days, size
 EFFECTIVE = 12.0  # hours that count as one: (1 + r)/(1 - r) of AR(1) over 6 h
 KNOWN = ("stated scatter, norm known", "stated scatter, norm to be learned", "own scatter of each band",
-         "and days that depend on each other", "and the misfit over seasons", "and the walk: the watch")  # fmt: skip
+         "and days that depend on each other", "and the walk: the watch")  # fmt: skip
 
 
 def uncertainties(watch: SiteWatch, days: int) -> Iterator[Array]:
@@ -52,10 +52,9 @@ def uncertainties(watch: SiteWatch, days: int) -> Iterator[Array]:
     before = min(begin - steps.begins[0], verdicts.LONGEST_DAYS)
     walk = verdicts.WALK_PER_ROOT_DAY * np.sqrt(np.array([(watch.day - begin + 1 + before) / 3.0]))
     one, none = np.ones_like(dependent), np.zeros(1)
-    misfit = verdicts.misfit_of(verdicts.limit_of(8, GATEWAYS[8])) ** 2 * dependent
     for info, inflation, walked in (
         (known, one, none), (learned_days / of_day, one, none), (own, one, none), (own, dependent, none),
-        (own, misfit, none), (own, misfit, walk),
+        (own, dependent, walk),
     ):  # fmt: skip
         yield jointly(np.zeros((1, *watch.shape)), info[None], watch.G, inflation, walked).u[0]
 

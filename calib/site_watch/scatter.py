@@ -17,14 +17,26 @@ from calib.model import Array
 
 LAGS_DAYS = (1, 7, 28)
 PRIOR_BLOCKS = 5.0  # by which a sensor's own inflation is drawn to the median of all
+FEWEST_BLOCKS = 6.0  # that a memory holds, of the longest lag too
 CLIP = 4.0  # standard deviations of a residual or block
 
 
 class Blocks:
-    """Sums of standardised residuals over blocks of `lags` days; `shape`: of what is summed, sensors first."""
+    """Sums of standardised residuals over blocks of `lags` days; `shape`: of what is summed, sensors first.
 
-    def __init__(self, shape: tuple[int, ...], lags: tuple[int, ...] = LAGS_DAYS) -> None:
-        self.lags = lags
+    `memory_days`: time constant with which blocks are forgotten, or FEWEST_BLOCKS of them where these are longer;
+    `prior_blocks`: by which a sensor's own inflation is drawn to the median of all.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        lags: tuple[int, ...] = LAGS_DAYS,
+        memory_days: float = np.inf,
+        prior_blocks: float = PRIOR_BLOCKS,
+    ) -> None:
+        self.lags, self.prior_blocks = lags, prior_blocks
+        self.keep = [float(np.exp(-1.0 / max(memory_days, FEWEST_BLOCKS * lag))) for lag in lags]
         self.sums, self.days, self.squares, self.count = (np.zeros((len(lags), *shape)) for _ in range(4))
         self.past: dict[int, tuple[Array, Array]] = {}
 
@@ -35,19 +47,23 @@ class Blocks:
             self.days[k] += there
             full = self.days[k] >= lag
             block = np.clip(self.sums[k], -CLIP * lag**0.5, CLIP * lag**0.5)
-            self.squares[k] += np.where(full, block**2 / lag, 0.0)
-            self.count[k] += full
+            self.squares[k] = self.keep[k] * self.squares[k] + np.where(full, block**2 / lag, 0.0)
+            self.count[k] = self.keep[k] * self.count[k] + full
             self.sums[k][full] = self.days[k][full] = 0.0
 
-    def inflation(self) -> Array:
-        """(lags, ...): variance ratio of each lag, the median over sensors; 1 where nothing is known, never less."""
-        some = self.count > 0
-        each = np.where(some, self.squares / np.where(some, self.count, 1.0), np.nan)
+    def inflation(self, squares: Array | None = None, count: Array | None = None) -> Array:
+        """(lags, ...): variance ratio of each lag, the median over sensors; 1 where nothing is known, never less.
+
+        Of today, or of the `squares` and `count` of another day.
+        """
+        squares, count = (self.squares, self.count) if squares is None or count is None else (squares, count)
+        some = count > 0
+        each = np.where(some, squares / np.where(some, count, 1.0), np.nan)
         known = some.sum(axis=1) > 0
         middle = np.ones(known.shape)
         for k in range(len(self.lags)):
             if known[k].any():
-                number = np.maximum(np.median(self.count[k], axis=0), 1.0)[known[k]]
+                number = np.maximum(np.median(count[k], axis=0), 1.0)[known[k]]
                 # The median of chi-squared over its degrees of freedom (Wilson and Hilferty).
                 middle[k][known[k]] = np.nanmedian(each[k][:, known[k]], axis=0) / (1.0 - 2.0 / (9.0 * number)) ** 3
         return np.maximum.accumulate(np.maximum(middle, 1.0), axis=0)
@@ -60,14 +76,15 @@ class Blocks:
     def over(self, today: int, begins: list[int]) -> Array:
         """Inflation of the means from these days until today, (k, n, ...), by the longest lag that is not longer.
 
-        A sensor's own, as it was before the begin, drawn to the median of all as by PRIOR_BLOCKS blocks.
+        A sensor's own, drawn to the median of all as by `prior_blocks`; both as they were before the begin, since the
+        others differ from a sensor that changes. The median is that of today where none was known.
         """
-        middle = self.inflation()
-        told = []
+        now, told = self.inflation(), []
         for begin in begins:
             k = int(np.searchsorted(self.lags, today - begin + 1, side="right")) - 1
-            squares, count = (part[k] for part in self.past[begin])
-            told.append((squares + PRIOR_BLOCKS * middle[k]) / (count + PRIOR_BLOCKS))
+            squares, count = self.past[begin]
+            middle = np.where(count[k].max(axis=0) >= 1.0, self.inflation(squares, count)[k], now[k])
+            told.append((squares[k] + self.prior_blocks * middle) / (count[k] + self.prior_blocks))
         return np.asarray(np.maximum(np.array(told), 1.0))
 
     def snapshot(self) -> dict[str, Any]:

@@ -21,7 +21,9 @@ DIRECTIONS = np.array(
     [[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0],
      [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=float,
 )  # fmt: skip
-SENSITIVITIES, ALL = slice(0, 4), 3
+SENSITIVITIES, ALL, TURNS = slice(0, 4), 3, slice(4, 7)
+PRIOR_TESTS = 60.0  # that are worth what all of a site say at one begin of the scatter of its steps
+MEDIAN_SQUARE = 0.4549  # the median of the square of a standard normal deviate
 REJECT = 6.0  # standard uncertainties from which a sensor or channel does not say what is common (Tukey's biweight)
 ROUNDS = 4
 LARGEST_RATIO = 10.0  # of the amplitudes of two axes, for the cross power to tell of a turn
@@ -55,17 +57,22 @@ def design(value: Array, level: Array) -> Array:
 @dataclass(frozen=True, slots=True, eq=False)
 class JointChange:
     """For each begin (k): `size`, `u` (k, n, 7): the change in each of DIRECTIONS by itself. `rest` (k, n, B, 6):
-    steps without what is common; `information` (k, n, B, 6): of these, over the variance."""
+    steps without what is common; `information` (k, n, B, 6): of these, over the variance. `statistic` (k, n, 7): the
+    change over its u; of a turn the smaller one of this and the same without the band that says most, since the weak
+    axis of one band says much of a turn, and moves by itself when the loads of two modes change. `scatter` (k, 1, 7):
+    factor of u by what all sensors of the site differ by."""
 
     size: Array
     u: Array
     rest: Array
     information: Array
+    statistic: Array
+    scatter: Array
 
     @property
-    def statistic(self) -> Array:
-        """The change over its standard uncertainty."""
-        return self.size / self.u
+    def evidence(self) -> Array:
+        """The statistic without the scatter of all sensors, which differs from begin to begin: it dates a change."""
+        return self.statistic * self.scatter
 
 
 def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: Array) -> JointChange:
@@ -81,10 +88,53 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
     both = information[..., :3] + others
     alone[..., :3] = information[..., :3] * others / np.where(both > 0.0, both, 1.0)
     score, squares = scores(rest, alone, G)
+    size, u = _sized(score, squares, inflation, walk)
+    scatter = _scatter_of_all(size / u)
+    u *= scatter
+    statistic = size / u
+    apart = _without_loudest(rest, alone, G[..., 3:])
+    size_apart, u_apart = _sized(*apart, inflation[..., TURNS], walk)
+    least = np.minimum(
+        np.abs(statistic[..., TURNS]), np.sign(size[..., TURNS]) * size_apart / u_apart / scatter[..., TURNS]
+    )
+    statistic[..., TURNS] = np.sign(size[..., TURNS]) * np.maximum(least, 0.0)
+    return JointChange(size, u, rest, alone, statistic, scatter)
+
+
+def _sized(score: Array, squares: Array, inflation: Array, walk: Array) -> tuple[Array, Array]:
+    """Size and u of changes, from the sums of `scores`; 0 and inf where nothing tells of one."""
     known = squares > 0.0
     squares = np.where(known, squares, 1.0)
     variance = np.where(known, inflation / squares, np.inf)
-    return JointChange(np.where(known, score / squares, 0.0), np.sqrt(variance + walk[:, None, None] ** 2), rest, alone)
+    return np.where(known, score / squares, 0.0), np.sqrt(variance + walk[:, None, None] ** 2)
+
+
+def _scatter_of_all(statistic: Array) -> Array:
+    """Factor of u (k, 1, 7), at least 1: what all sensors differ by at a begin, over what they are expected to.
+
+    Of sensitivities, and of turns. A median, since most sensors have not changed; what they all show, such as a frost
+    or a storm that the norm does not fit, is scatter. A sensor that changes moves all others alike, which does not
+    count. Few sensors say little of it.
+    """
+    factor = np.ones((len(statistic), 1, len(DIRECTIONS)))
+    for own, others in ((slice(0, 3), SENSITIVITIES), (TURNS, TURNS)):
+        z = np.where(statistic[..., own] == 0.0, np.nan, statistic[..., own])
+        squares = np.square(z - median(z, axis=1)[:, None]).reshape(len(z), -1)
+        number = np.sum(np.isfinite(squares), axis=1)
+        middle = median(squares, axis=1) / MEDIAN_SQUARE
+        variance = (PRIOR_TESTS + number * middle) / (PRIOR_TESTS + number)
+        factor[..., others] = np.sqrt(np.maximum(variance, 1.0))[:, None, None]
+    return factor
+
+
+def _without_loudest(rest: Array, information: Array, G: Array) -> tuple[Array, Array]:
+    """As `scores` of turns (k, n, 3), without the band that says most of each; `G` (n, B, 6, 3)."""
+    push = np.einsum("knbc,nbct->knbt", information * rest, G, optimize=True)
+    squares = np.einsum("knbc,nbct->knbt", information, np.square(G), optimize=True)
+    total = push.sum(axis=2, keepdims=True)
+    loudest = np.argmax(push * np.sign(total), axis=2)[:, :, None]
+    left = [each.sum(axis=2) - np.take_along_axis(each, loudest, axis=2)[:, :, 0] for each in (push, squares)]
+    return left[0], np.where(left[1] > 1e-9 * squares.sum(axis=2), left[1], 0.0)
 
 
 def scores(values: Array, information: Array, G: Array) -> tuple[Array, Array]:

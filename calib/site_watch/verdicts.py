@@ -28,10 +28,11 @@ FEWEST_DAYS = 21  # that teach the norm of a sensor
 FEWEST_SINCE = 3  # days after a step, before it is told
 WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk after a day: 0.06 % in a year
 COVERAGE = 2.0
-# Factor of u for what the norm does not fit over seasons, with a limit of so many standard deviations, and what it
-# gains by the square of the limit beyond, because tails are heavier than those of a normal distribution. From the sound
-# sites of benchmarks/site_watch.py: 1.10 for 8 sensors, 1.16 for 30, 1.45 for 200.
-MISFIT, MISFIT_FROM, MISFIT_BEYOND = 1.10, 4.55, 0.9
+APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the norm does not fit over seasons
+# Part of the variance of a sensor that all of its gateway share: they are neighbours, and shapes move smoothly along a
+# structure. Assumed.
+PART_SHARED = 0.25
+LEAST_NOISE = 0.03  # of the amplitude of the noise, for its change to be told: a sensitivity changes the noise alike
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 FEWEST_BANDS = 3  # for bands to be called alike
 NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
@@ -127,11 +128,6 @@ def limit_of(sensors: int, gateways: int, per_year: float = FALSE_ALARMS_PER_YEA
     """Standard deviations that no sound test may exceed, with `per_year` false alarms of the whole site."""
     tests = sensors * (len(DIRECTIONS) + 1 + 3) + gateways
     return -NORMAL.inv_cdf(0.5 * per_year / (tests * LOOKS_PER_YEAR))
-
-
-def misfit_of(limit: float) -> float:
-    """The factor of u for what the norm does not fit, with this limit of the tests."""
-    return MISFIT + MISFIT_BEYOND * max(limit - MISFIT_FROM, 0.0) ** 2
 
 
 def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
@@ -242,10 +238,9 @@ def examined(watch: SiteWatch, without: NDArray[np.bool_] | None = None) -> Test
     ages = np.array([watch.day - begins[k] + 1 for k in which], dtype=float)
     before = np.minimum([begins[k] - begins[0] for k in which], LONGEST_DAYS)
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
-    misfit = misfit_of(limit_of(shape[0], len(set(watch.gateway.tolist()))))
-    inflation = misfit**2 * watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
+    inflation = watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
     joint = jointly(size, information, watch.G, inflation, walk)
-    apart = _apart(joint, watch.G, misfit)
+    apart = _apart(joint, watch.G)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
     return Tests([begins[k] for k in which], joint, apart, bands)
 
@@ -256,7 +251,7 @@ def _without(variance: Array, size: Array, information: Array, days: Array) -> A
     return np.asarray(np.maximum(variance - size**2 * information / freedom, LEAST_VARIANCE * variance))
 
 
-def _apart(joint: JointChange, G: Array, misfit: float) -> Array:
+def _apart(joint: JointChange, G: Array) -> Array:
     """How much the bands of each sensor differ from any change of its sensitivities and any turn, (k, n).
 
     What most sensors show, such as days that the norm does not fit, is taken as scatter.
@@ -274,7 +269,7 @@ def _apart(joint: JointChange, G: Array, misfit: float) -> Array:
     freedom = np.sum(info > 0.0, axis=-1) - g.shape[-1]
     f = np.maximum(freedom, 1).astype(float)
     site = median(np.where(freedom > 0, squares / f, np.nan), axis=1)
-    ratio = squares / f / (misfit * np.maximum(site, 1.0))[:, None]
+    ratio = squares / f / (APART_MISFIT * np.maximum(site, 1.0))[:, None]
     deviate = (np.cbrt(ratio) - (1.0 - 2.0 / (9.0 * f))) / np.sqrt(2.0 / (9.0 * f))
     return np.asarray(np.where(freedom > 0, deviate, -np.inf))
 
@@ -283,8 +278,9 @@ def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorV
     """The verdict of one sensor by itself."""
     statistic, apart = tests.joint.statistic[:, i], tests.apart[:, i]
     direction = int(np.argmax(np.abs(statistic).max(axis=0)))
-    best, dates = tests.dated(statistic[:, direction] ** 2)
-    z = abs(float(statistic[best, direction]))
+    z = float(np.abs(statistic[:, direction]).max())
+    sure = np.abs(statistic[:, direction]) >= min(z, limit)
+    best, dates = tests.dated(np.where(sure, tests.joint.evidence[:, i, direction], 0.0) ** 2)
     if apart.max() > limit and (z <= limit or apart[best] > limit):
         worst, dates = tests.dated(np.maximum(apart, 0.0) ** 2)
         return SensorVerdict(
@@ -339,7 +335,7 @@ def _noise(watch: SiteWatch, limit: float) -> list[SensorVerdict]:
         found = SensorVerdict("noise", f"noise of {'xyz'[axis]}", factor - 1.0, expanded,
                               begin, begin, begin, float(z[k, i, axis]))  # fmt: skip
         few = student_quantile(NORMAL.cdf(limit), float(days[i, axis]) - TERMS + PRIOR_DEGREES)
-        told.append(found if found.statistic > few else NOTHING)
+        told.append(found if found.statistic > few and abs(found.size) > LEAST_NOISE else NOTHING)
     return told
 
 
@@ -356,7 +352,7 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[SensorVerdict], limi
     what = "the two gateways differ; which of them changed is not seen" if pair else "all its sensors alike"
     for g, number in enumerate(numbers.tolist()[: 1 if pair else None]):
         own = index == g
-        best, dates = tests.dated(np.square(mean[:, g] / u[:, g]))
+        best, dates = tests.dated(np.square(mean[:, g] / u[:, g] * tests.joint.scatter[:, 0, ALL]))
         z = abs(float(mean[best, g] / u[best, g]))
         alone = np.abs(tests.joint.statistic[best, own, SENSITIVITIES]).max()
         if z > max(limit, alone) and fits[best, g] and (own & alike).sum() > 1:
@@ -374,10 +370,11 @@ def _means(joint: JointChange, index: NDArray[np.int64], counts: NDArray[np.bool
     member = np.eye(index.max() + 1)[index]  # (n, g)
     total = weight @ member
     mean = np.where(total > 0.0, (weight * s) @ member / np.where(total > 0.0, total, 1.0), np.nan)
-    variance = np.where(total > 0.0, 1.0 / np.where(total > 0.0, total, 1.0), np.inf)
+    shared = 1.0 + PART_SHARED * np.maximum((weight > 0.0) @ member - 1.0, 0.0)
+    variance = np.where(total > 0.0, shared / np.where(total > 0.0, total, 1.0), np.inf)
     pair = mean.shape[1] == 2
     centre = mean[:, 1] if pair else median(mean, axis=1)
-    others = variance[:, 1] if pair else np.pi / 2.0 / np.maximum(total.sum(axis=1), 1e-300)
+    others = variance[:, 1] if pair else np.pi / 2.0 / np.maximum((total / shared).sum(axis=1), 1e-300)
     away = np.abs(s - np.nan_to_num(mean) @ member.T)
     reach = np.maximum(4.0 * joint.u[:, :, ALL], 0.3 * np.abs(np.nan_to_num(mean - centre[:, None]) @ member.T))
     wrong = ((away > reach) & (weight > 0.0)) @ member

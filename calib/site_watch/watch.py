@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.site_watch.day import Day, SelfTests, Visits
-from calib.site_watch.scatter import Blocks
+from calib.site_watch.scatter import LAGS_DAYS, Blocks
 from calib.site_watch.steps import HUBER, PRIOR_DEGREES, TERMS, Steps
 from calib.site_watch.together import DIRECTIONS, biweight, design, scores
 from calib.site_watch.witnesses import supply_basis
 
 ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
 FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, or its residual to count
+MEMORY_DAYS = 60.0  # of the scatter of days: frost, traffic and wind make it another one in each season
+PRIOR_BLOCKS = 30.0  # by which a sensor's own scatter of days is drawn to that of all: its test has no wide tails
 FEWEST_SENSORS = 3  # with a band, for its common level to be taken out
 CHANNELS = 6
 WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
@@ -47,7 +49,7 @@ class SiteWatch:
         self.self_tests = Steps(self.shape[0] * 3)
         self.frequencies = Steps(self.shape[0] * self.shape[1] * 3)
         self.u_supply = np.full((self.shape[0], 3), np.nan)  # of the newest self-test
-        self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)))
+        self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)), LAGS_DAYS, MEMORY_DAYS, PRIOR_BLOCKS)
         self.band_scatter = Blocks(self.shape, lags=(1, 7))
         self.noise_scatter = Blocks((self.shape[0], 3))
         self.mean_scatter = Blocks((self.shape[0], 3))

@@ -208,6 +208,18 @@ def test_a_noise_floor_that_doubles_is_noise(learned: tuple[Site, SiteWatch]) ->
     assert abs(found.sensors[5].size - (2**0.5 - 1)) < found.sensors[5].U
 
 
+def test_noise_that_a_sensitivity_moves_is_not_told(learned: tuple[Site, SiteWatch]) -> None:
+    """2 % more noise, steady to 0.1 % so that it is sure: a sensitivity moves the noise alike."""
+    site, watch = copy.deepcopy(learned[0]), SiteWatch(GATEWAY, BANDS_HZ)
+    for number in range(80):
+        day = site.day()
+        day.log_noise[:] = -4.0 + site.random.normal(0, 0.001, (site.n, 3))
+        day.log_noise[5, 1] += np.log(1.02) if number >= 60 else 0.0
+        watch.update(day)
+    assert kinds(result(watch)) == {}
+    assert np.abs(watch.noise.step([watch.noise.begins.index(day.number - 19)])[0]).max() > 0.015
+
+
 def test_what_all_share_is_seen_by_a_sensor_beside_a_reference_alone(learned: tuple[Site, SiteWatch]) -> None:
     site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
     change[1:, :3] = 0.02
@@ -297,6 +309,64 @@ def test_blocks_tell_how_far_days_depend_on_each_other() -> None:
     assert day == pytest.approx(1.0, abs=0.06)
     assert week == pytest.approx(3.0 - 4.0 * (1.0 - 0.5**7) / 7.0, rel=0.1)
     assert month == pytest.approx(3.0 - 4.0 / 28.0, rel=0.15)
+
+
+def test_blocks_with_a_memory_follow_the_season() -> None:
+    """A variance of 4 after a year of 1: 120 days later a memory of 60 days tells 3.6, and one without end 1.7."""
+    random = np.random.default_rng(6)
+    short, endless, there = Blocks((50, 1), (1,), memory_days=60.0), Blocks((50, 1), (1,)), np.ones((50, 1), dtype=bool)
+    for day in range(485):
+        z = random.normal(0.0, 1.0 if day < 365 else 2.0, (50, 1))
+        short.update(z, there)
+        endless.update(z, there)
+    assert short.inflation()[0, 0] == pytest.approx(4.0 - 3.0 * np.exp(-2.0), abs=0.3)
+    assert endless.inflation()[0, 0] == pytest.approx(1.0 + 3.0 * 120 / 485, abs=0.15)
+
+
+def test_what_was_known_before_a_change_loosens_its_test_and_nothing_since() -> None:
+    blocks, there = Blocks((9, 1), (1,)), np.ones((9, 1), dtype=bool)
+    for day in range(100):
+        blocks.update(np.where(np.arange(9)[:, None] % 2, 1.0, -1.0), there)
+        blocks.remember([day])
+    blocks.past[100] = blocks.past[99]
+    for _ in range(100):
+        blocks.update(np.full((9, 1), 3.0), there)
+    assert blocks.over(200, [100])[0, :, 0] == pytest.approx(np.full(9, 1.0), abs=0.02)
+    assert blocks.inflation()[0, 0] > 4.0, "today's is larger"
+
+
+def steps_of(z: Array) -> tuple[Array, Array, Array]:
+    """Steps (1, n, B, 6) that are z standard deviations in the outputs alone, their information, and G."""
+    G = design(np.zeros((*z.shape[:2], 6)), np.zeros((z.shape[1], 3)))
+    step, information = np.zeros((1, *z.shape[:2], 6)), np.full((1, *z.shape[:2], 6), 1e4)
+    step[0, :, :, :3] = 0.01 * z
+    return step, information, G
+
+
+def test_what_all_sensors_differ_by_at_a_begin_is_scatter_and_one_that_changes_is_not() -> None:
+    """40 sensors whose steps scatter three times as they should: u is 2.5 times as large; the others' u stays."""
+    z, one, none = np.random.default_rng(7).normal(size=(40, 6, 3)), np.ones((1, 40, 7)), np.zeros(1)
+    sound = jointly(*steps_of(z), one, none)
+    assert sound.scatter.max() < 1.2
+    frost = jointly(*steps_of(3.0 * z), one, none)
+    assert 2.2 < frost.scatter[0, 0, 0] < 3.0
+    assert frost.evidence[..., :4] == pytest.approx((frost.size / frost.u * frost.scatter)[..., :4]), "dates"
+    z[4] += 20.0
+    changed = jointly(*steps_of(z), one, none)
+    assert changed.scatter.max() < 1.2
+    assert changed.statistic[0, 4, ALL] > 30.0
+
+
+def test_a_turn_stands_without_the_band_that_says_most() -> None:
+    """Cross powers xy that move in one band are no turn about z; in all six they are."""
+    one, none = np.ones((1, 9, 7)), np.zeros(1)
+    step, information, G = steps_of(np.zeros((9, 6, 3)))
+    G[2, :, 3, 5] = 1.0
+    step[0, 2, 0, 3] = 0.4
+    alone = jointly(step, information, G, one, none)
+    assert abs(alone.statistic[0, 2, 6]) < 0.1 < abs(alone.size[0, 2, 6] / alone.u[0, 2, 6])
+    step[0, 2, :, 3] = 0.1
+    assert jointly(step, information, G, one, none).statistic[0, 2, 6] > 15.0
 
 
 def test_hours_are_merged_without_their_levels_and_without_noise() -> None:
