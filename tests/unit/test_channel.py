@@ -96,6 +96,7 @@ def test_states_of_many_devices_in_one_place_the_oldest_go() -> None:
     assert list(kept) == ["4", "6", "7", "8", "9", "10", "11", "5"]
 
 
+@pytest.mark.slow
 def test_windows_held_for_a_wrong_reference_go_with_it() -> None:
     site = begun(site_config())
     site.play(3)
@@ -136,6 +137,7 @@ def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
     assert abs(later.sensitivity[1][1] - S_TRUE[1, 1]) < 2e-3
 
 
+@pytest.mark.slow
 def test_a_step_in_a_later_run_is_dated_in_utc() -> None:
     """The estimation counts its days through all runs; here the second one begins on day 30."""
     site = begun(site_config())

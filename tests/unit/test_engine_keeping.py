@@ -21,6 +21,7 @@ def kept(directory: Path) -> Path:
     return directory / ENGINES / file_name(engine_id())
 
 
+@pytest.mark.slow
 def test_wheel_is_written_once_and_found_by_an_audit(tmp_path: Path) -> None:
     sha256 = keep_engine(tmp_path)
     path = kept(tmp_path)

@@ -145,7 +145,7 @@ def test_thread_of_an_engine_is_allowed() -> None:
     assert begun(does + "thread.start()\nthread.join()") == "EngineFaultError: from a thread"
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("does", "limits", "told"),
     [

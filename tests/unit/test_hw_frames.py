@@ -208,7 +208,7 @@ frames_of_binary = st.one_of(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "changes",
     [

@@ -48,6 +48,7 @@ def test_with_a_filter_s_is_right_at_its_frequency_and_q_is_right(
     assert np.abs(np.concatenate(z)).max() < 4.0
 
 
+@pytest.mark.slow
 def test_a_pure_delay_costs_little_and_no_lag_costs_nothing() -> None:
     u = {lag_s: _u_main(lag_s) for lag_s in (0.0, 0.005)}
     assert u[0.0] < 0.0027  # 0.0025 if both instruments were known to respond alike

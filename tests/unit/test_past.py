@@ -225,6 +225,7 @@ def test_between_two_epochs_it_is_on_their_line_as_an_epoch_there_would_be() -> 
     assert past.knows(past.begin - 0.99 * REACH_DAYS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_last_epoch_is_the_present(fixed: bool) -> None:
     """Of a fixed mount as well, where Q is read from the mean output: in the past from that of each epoch."""

@@ -81,6 +81,7 @@ def test_planes_that_change_determine_everything_together() -> None:
         assert outcome.standard_uncertainty[:9].max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("third", "determined"), [(1.0, 0), (10.0, 9), (30.0, 9)])
 def test_a_weak_motion_along_the_normal_counts_where_it_is_more_than_noise(third: float, determined: int) -> None:
     world = World("band", third=third)

@@ -129,6 +129,7 @@ def test_what_comes_after_a_slip_is_refused_until_the_sensor_is_turned() -> None
     assert found[1].numbers["slipped_mps2"] == pytest.approx(G_MPS2 * slip_rad, abs=0.01)
 
 
+@pytest.mark.slow
 def test_two_stops_near_each_other_are_told_apart_once_the_offset_is_known() -> None:
     lean = G_MPS2 * np.array([np.sin(np.deg2rad(5.0)), 0.0, np.cos(np.deg2rad(5.0))])
     stops = [*FACES, -FACES[0], -FACES[1], lean]

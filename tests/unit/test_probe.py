@@ -158,6 +158,7 @@ def on_spi(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0)
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("driver", "kind", "rate_hz", "says"),
     [

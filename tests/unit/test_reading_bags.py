@@ -333,6 +333,7 @@ def ros1(path: Path, compression: str = "", publishers: int = 1) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["", "BZ2", "LZ4"])
 def test_a_bag_of_ros_1(compression: str, tmp_path: Path) -> None:
     path = ros1(tmp_path / "a.bag", compression)

@@ -32,7 +32,7 @@ MATLAB: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("kind", "compressed"), [*((kind, True) for kind in MATLAB), ("a structure", False)])
 def test_matlab(kind: str, compressed: bool, tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", MATLAB[kind], do_compression=compressed)
@@ -73,7 +73,7 @@ def test_a_file_that_ends_its_reader_is_told(tmp_path: Path) -> None:
     fault(written(tmp_path, bytes(data), "b.mat"), "cannot be read: .*; save it with -v7")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_damaged_matlab(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", MATLAB["vectors"], do_compression=True)
     data = (tmp_path / "a.mat").read_bytes()

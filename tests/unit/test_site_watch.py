@@ -176,6 +176,7 @@ def test_a_gateway_is_told_as_the_gateway(learned: tuple[Site, SiteWatch]) -> No
     assert abs(found.gateways[1].size + 0.01) < found.gateways[1].U
 
 
+@pytest.mark.slow
 def test_of_two_gateways_it_is_not_told_which_and_of_one_nothing_is_seen() -> None:
     for gateway, told in ((GATEWAY // 2, [0]), (0 * GATEWAY, [])):
         site = Site(6, gateway)
