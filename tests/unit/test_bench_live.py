@@ -73,6 +73,7 @@ def test_the_driver_gets_the_benchs_counts_from_its_zero_on() -> None:
         assert late_s.max() < 1 / 1013 + 1.5e-3
 
 
+@pytest.mark.slow
 def test_the_chips_temperature_is_the_benchs() -> None:
     clock = HandClock()
     with LiveBench(faulty(2), 2, clock=clock) as live:

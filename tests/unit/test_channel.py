@@ -21,6 +21,7 @@ from tests.unit.mounted_site import EPOCH_NS, SECOND, WINDOW_S, Site, begun, sai
 OF_B = S_TRUE * 0.97
 
 
+@pytest.mark.slow
 def test_a_to_b_to_a_goes_on_where_each_was() -> None:
     site = begun(site_config())
     of_a = updates(site.play(4))[-1]
@@ -122,6 +123,7 @@ def test_another_reference_after_a_restart_is_not_taken_for_the_one_before(order
         assert len(estimation.state.references) == references
 
 
+@pytest.mark.slow
 def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
     site = begun(site_config())
     before = updates(site.play(4))[-1]

@@ -61,6 +61,7 @@ def test_a_clamp_on_a_spring_is_loose():
     assert "loose" in findings(found, "sensor")["loose"]
 
 
+@pytest.mark.slow
 def test_little_motion_is_no_loose_clamp():
     _, found = _seen(Clamped(calm=True), seconds=60.0)
     assert set(findings(found, "sensor")) == {"little motion"}

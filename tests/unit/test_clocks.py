@@ -106,6 +106,7 @@ def test_a_lag_that_no_window_told_is_unknown() -> None:
         assert (report.device, math.isnan(report.lag_s), math.isnan(report.u_lag_s)) == ("s", True, True)
 
 
+@pytest.mark.slow
 def test_each_device_that_speaks_is_reported_once_a_minute_of_the_run() -> None:
     found = pipeline(reference=True, rate_hz=100.0)
     reports = clocks(found, both(190.0))

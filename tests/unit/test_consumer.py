@@ -215,6 +215,7 @@ def test_a_gateway_that_did_not_answer_is_asked_again(site: Site) -> None:
     follower.stop()
 
 
+@pytest.mark.slow
 def test_what_is_no_result_is_passed_over(site: Site, gateway: Gateway) -> None:
     gateway.publisher.start()
     wait_for(lambda: gateway.publisher.state().connected)

@@ -76,6 +76,7 @@ def test_disk_that_is_full_is_left_as_it_was(tmp_path: Path, caplog: pytest.LogC
     assert os.listdir(tmp_path / ENGINES) == []
 
 
+@pytest.mark.slow
 def test_release_is_added_to_the_list_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(known, "_LIST", tmp_path / "known.json")
     known.known_engines.cache_clear()

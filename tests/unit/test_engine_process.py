@@ -64,6 +64,7 @@ def process(own: EngineWheel) -> Iterator[EngineProcess]:
         yield engine
 
 
+@pytest.mark.slow
 def test_results_are_those_of_the_pipeline_bit_for_bit(process: EngineProcess) -> None:
     results = 0
     for step in RecordingReader(GOLDEN).steps():

@@ -192,6 +192,7 @@ def test_propose_and_observe_put_nothing_in_force() -> None:
         assert found.state.windows == 6  # the state goes on unseen
 
 
+@pytest.mark.slow
 def test_what_is_accepted_keeps_how_it_goes_with_temperature() -> None:
     random = np.random.default_rng(8)
     found = estimation(gate={"policy": "propose"}, uncertainty={"offset_mps2": 0.001})

@@ -254,6 +254,7 @@ def as_line(result: SelfTestReport, gateway: str) -> dict[str, Any]:
     return dict(msgspec.json.decode(msgspec.json.encode(result)) | {"gateway": gateway})
 
 
+@pytest.mark.slow
 def test_recordings_say_the_same_as_lines(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     few = [row for row in clean if row["sequence"] < 24 * 3]
     tests = [as_line(self_test(row, row["sequence"]), row["gateway"]) for row in few if row["sequence"] % 24 == 3]

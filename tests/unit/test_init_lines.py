@@ -117,6 +117,7 @@ def test_what_init_writes_is_read_without_a_loss(name: str, tmp_path: Path) -> N
     assert {tuple(row) for block in blocks for row in block.indications.tolist()} == {(0.12, -0.05, 9.8)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "count"),
     [

@@ -81,6 +81,7 @@ def test_white_noise_that_shows_beside_the_motion_is_the_sensors() -> None:
         assert found.more["budget"].get("whose noise it is", {"Sxx": 0.0})["Sxx"] < 5e-4
 
 
+@pytest.mark.slow
 def test_a_reference_whose_noise_is_stated_has_no_more() -> None:
     """0.1 mm/s2 is stated of the reference: what is incoherent is the sensor's."""
     noisy = within(0.01, of_reference=False)

@@ -200,6 +200,7 @@ def test_axes_that_are_not_where_they_were_stated_are_valid_with_a_warning(name:
     assert json.loads(found.to_json())["warnings"] == list(found.warnings)
 
 
+@pytest.mark.slow
 def test_a_sensor_turned_by_thirty_degrees_needs_its_rotation() -> None:
     c, s = np.cos(np.deg2rad(30.0)), np.sin(np.deg2rad(30.0))
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -263,6 +264,7 @@ def in_rad(poses: list[dict[str, float]], *names: str) -> list[dict[str, float]]
     return [row | {name: np.deg2rad(row[name]) for name in names} for row in poses]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names", [("alpha_deg",), pytest.param(("theta_deg", "alpha_deg"), marks=pytest.mark.thorough)]
 )

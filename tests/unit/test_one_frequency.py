@@ -125,6 +125,7 @@ def test_the_agent_is_right_at_that_frequency_as_well(seed: int) -> None:
     assert update.valid_band_hz[0] < 6.0 < update.valid_band_hz[1]
 
 
+@pytest.mark.slow
 def test_the_attenuation_is_told_as_such() -> None:
     """The paper's bench with exact angles: a filter of first order at 31 Hz attenuates 3 Hz by 0.47 %."""
     outcome = calibrated(bench(3.0, lowpass_hz=31.0), 2, stated())

@@ -29,6 +29,7 @@ def test_on_hold_nothing_changes_until_it_is_released() -> None:
     assert updates(site.play(2))[-1].windows > before.windows
 
 
+@pytest.mark.slow
 def test_a_hold_outlives_a_kill() -> None:
     site = begun(site_config())
     site.play(3)

@@ -185,6 +185,7 @@ def test_a_reference_of_velocity_is_a_vibrometer(tmp_path: Path) -> None:
     assert reference_of(named).startswith("laser: Polytec ")
 
 
+@pytest.mark.slow
 def test_a_reference_of_acceleration_is_an_accelerometer(tmp_path: Path) -> None:
     result, _ = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
     assert reference_of(certificate(tmp_path, result, output_unit="")).startswith("reference accelerometer: PCB ")

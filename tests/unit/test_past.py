@@ -188,6 +188,7 @@ def test_epochs_stand_at_windows_on_both_sides_of_a_change_and_within_long_gaps(
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepped", ["Syy", "Syz"])
 def test_a_change_is_the_difference_of_both_sides(stepped: str) -> None:
     """Of a fixed mount, whose mean output stays: with S_yz, along which gravity acts, Q_y changes as well."""

@@ -64,6 +64,7 @@ def test_a_tone_is_told_at_its_own_frequency(starts_and_stops: bool) -> None:
     assert outcome.reference_frequency_hz == pytest.approx(6.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_one_direction_is_named_as_such() -> None:
     world = World("band", directions=1)
     of = made(world, 3)

@@ -54,6 +54,7 @@ def test_a_bomb_beside_the_variables_is_refused(tmp_path: Path, monkeypatch: pyt
     fault(written(tmp_path, data, "b.mat"), "the file says that it holds .* are allowed for its size")
 
 
+@pytest.mark.slow
 def test_a_cell_array_that_announces_too_much_is_refused(tmp_path: Path) -> None:
     cells = np.empty((2, 3), object)
     cells[:] = "a"

@@ -103,6 +103,7 @@ def test_u_covers_with_the_error_of_the_reference() -> None:
     assert inside >= 15  # 99.9 % of binomials of 20 with 0.9545
 
 
+@pytest.mark.slow
 def test_the_response_is_told_as_it_is() -> None:
     response = ALIKE["low-pass, order 2"]
     made = pair(2, response)
@@ -307,6 +308,7 @@ def test_a_channel_with_less_power_than_its_noise_is_silent() -> None:
     assert np.all(np.isfinite(found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4, 8])
 def test_short_stops_beside_an_ac_coupled_reference_settle(seed: int) -> None:
     """Three stops of 4 s, the last one at the end of the recording, with both instruments alike. A filter below the

@@ -81,6 +81,7 @@ def test_a_run_loads_nothing_while_devices_are_read() -> None:
     assert run.stdout.splitlines()[-1] == ""
 
 
+@pytest.mark.slow
 def test_calibrate_from_text_loads_no_configuration_and_no_scipy() -> None:
     """To load them takes a quarter of a second."""
     code = "import sys, agent.cli.calibrate\nprint(*sorted({name.partition('.')[0] for name in sys.modules}))"

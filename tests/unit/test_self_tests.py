@@ -159,6 +159,7 @@ def test_a_device_tests_itself_at_the_stated_time_and_then_measures_as_before() 
     assert all(np.abs(block.indications - [0, 0, 256]).max() < 10 for block in blocks)
 
 
+@pytest.mark.slow
 def test_a_range_that_gravity_and_the_self_test_do_not_fit_is_left_for_the_self_test_alone() -> None:
     bus = Bus(Lis3dhTwin, 1000.0)
     sensor = QuickLis3dh("s", Lis3dhOptions(rate_hz=400.0, range_g=2, address=0x19), **bus.timing)

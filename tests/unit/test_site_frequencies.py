@@ -91,6 +91,7 @@ def test_a_frequency_that_falls_at_all_sensors_is_the_structure(band: int) -> No
     assert not found.gateways
 
 
+@pytest.mark.slow
 def test_sound_frequencies_follow_the_temperature_and_are_not_told() -> None:
     assert [len(after(40, seed=seed).frequencies) for seed in range(2)] == [0, 0]
 
@@ -100,6 +101,7 @@ def test_what_one_sensor_sees_alone_is_not_the_structure() -> None:
     assert not after(20, in_window(2, 0.05, slice(0, 2))).frequencies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("see", [2, 3])
 def test_a_frequency_that_fewer_than_three_sensors_see_is_not_told(see: int) -> None:
     site, watch = Frequencies(8), SiteWatch(GATEWAY, BANDS_HZ)
@@ -133,6 +135,7 @@ def test_what_bands_do_since_a_frequency_has_changed_is_told_of_no_sensor() -> N
     assert [one.kind for one in found.sensors] == ["none"] * N
 
 
+@pytest.mark.slow
 def test_a_sensor_that_changes_at_another_time_is_still_named() -> None:
     site, watch = fifty_days()
     shift = np.zeros((N, len(BANDS_HZ), 3))
@@ -153,6 +156,7 @@ def test_a_visit_does_not_touch_frequencies() -> None:
     assert len(result(watch).frequencies) == 1
 
 
+@pytest.mark.slow
 def test_days_of_results_without_frequencies_are_silent_on_them() -> None:
     site, watch = Frequencies(4), SiteWatch(GATEWAY, BANDS_HZ)
     for k in range(80):
@@ -178,6 +182,7 @@ def test_the_frequency_of_a_day_needs_hours_and_clips_outliers() -> None:
     assert found[2] == pytest.approx(np.repeat(own[2][:, None], 3, axis=1), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_watch_of_frequencies_goes_on_from_its_snapshot() -> None:
     site, watch = Frequencies(6), SiteWatch(GATEWAY, BANDS_HZ)
     for _ in range(40):

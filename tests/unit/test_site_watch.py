@@ -145,6 +145,7 @@ def test_the_design_of_a_turn_is_the_difference_of_turned_spectra() -> None:
     assert np.array_equal(G[:, :3], np.eye(6)[:, :3])
 
 
+@pytest.mark.slow
 def test_one_sensor_is_named_with_size_and_date(learned: tuple[Site, SiteWatch]) -> None:
     found = after(learned, 12, [4], [0, 0, -0.01, 0, 0, 0])
     assert kinds(found) == {4: "sensitivity"}

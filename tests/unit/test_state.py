@@ -104,6 +104,7 @@ def test_the_stated_uncertainty_covers(runs: int, least: int) -> None:
     assert 0.93 * 12 * runs <= covered.sum() <= 0.99 * 12 * runs, covered.sum() / 12 / runs
 
 
+@pytest.mark.slow
 def test_what_was_not_excited_stays_to_the_last_digit() -> None:
     random, found = np.random.default_rng(1), mounted()
     for k in range(40):
