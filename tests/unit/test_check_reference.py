@@ -162,7 +162,7 @@ def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() 
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1]) < 3 * u
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
     found = sound()
     assert actions(judged(found, 105, 12, 3, STEPPED["first"], turns=(FIRST,) * 3)) == ["hold"] * 3
@@ -172,7 +172,7 @@ def test_a_weak_window_of_the_other_reference_is_no_witness() -> None:
     assert "no window with c tells" in reason
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_sound_windows_of_the_other_reference_do_not_dismiss_held_ones() -> None:
     found = sound()
     turns = (FIRST, FIRST, SECOND, SECOND, SECOND, SECOND, FIRST, FIRST, FIRST)
