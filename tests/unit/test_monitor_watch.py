@@ -159,7 +159,7 @@ def test_the_monitor_says_what_the_files_say_and_what_it_said_lasts(tmp_path: Pa
         assert fleet.alarms() == []
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_self_tests_are_in_the_sum_of_their_day(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
     few = [row for row in rows if row["sequence"] < 24 * 3 and row["gateway"] == "north"]
     database = Database(engine, now_ns=lambda: NOW_NS)

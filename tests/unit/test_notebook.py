@@ -286,7 +286,7 @@ def test_warnings_stand_above_the_table(result: Outcome, capsys: pytest.CaptureF
     assert json.loads(warned.to_json())["warnings"] == ["det S is negative", "the reference reads 260 g"]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_figure_shows_s_q_response_and_windows(result: Outcome) -> None:
     figure = result.plot()
     assert [axes.get_title(loc="left").split(":")[0] for axes in figure.axes] == ["S", "Q", "response", "windows"]
