@@ -45,9 +45,9 @@ PROCESSES = $$((2 * $$(nproc)))
 # $(1): processes; $(2): which tests
 tested = $(BIN)/python -m pytest -n $(1) --dist loadscope --no-loadscope-reorder $(2)
 
-# The drivers' contract reads 20,000 samples here, and where a device counts them in 16 bits more than these hold;
+# The drivers' contract reads 5,000 samples here, and where a device counts them in 16 bits more than these hold;
 # `pytest tests/contract` reads a million.
-test test-all test-thorough: export FIELDCAL_CONTRACT_SAMPLES = 20000
+test test-all test-thorough: export FIELDCAL_CONTRACT_SAMPLES = 5000
 test: $(VENV)/development  ## before a merge: what decides whether results, uncertainties, recordings and the program are right
 	$(call tested,$(PROCESSES),-m "not faults and not thorough") || $(call once_more,-m "not faults and not thorough")
 
@@ -78,9 +78,10 @@ bench: $(VENV)/development  ## figures, each a ratio against a named alternative
 faults: $(VENV)/development  ## breaks the agent on purpose, for an hour; needs root and tools; writes docs/reliability.md
 	$(BIN)/python -m tests.faults
 
-# The slow disk is tested alone, because a busy machine makes a disk look slower than it is. What failed runs once more.
+# Most of them wait for an agent, which takes a third of a processor. The slow disk is tested alone, because a busy
+# machine makes a disk look slower than it is. What failed runs once more.
 faults-short: $(VENV)/development  ## the same in a few minutes; skips what this machine cannot do
-	$(BIN)/python -m pytest -n auto --dist worksteal -m faults tests/faults -k "not slow" || \
+	$(BIN)/python -m pytest -n $(PROCESSES) --dist worksteal -m faults tests/faults -k "not slow" || \
 		$(call once_more,-m faults tests/faults)
 	$(BIN)/python -m pytest -m faults tests/faults -k slow || \
 		$(call once_more,-m faults tests/faults)

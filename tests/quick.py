@@ -7,7 +7,7 @@ from collections import defaultdict
 
 import pytest
 
-LIMIT_S = 0.5  # what takes more is marked `slow`
+LIMIT_S = 0.3  # what takes more is marked `slow`
 MOST_S = 6 * LIMIT_S  # what takes more fails; the first test imports libraries, and a busy or slow machine needs more
 BEGAN_S = pytest.StashKey[float]()
 

@@ -204,6 +204,7 @@ def with_a_broken_clock(snapshot: bytes) -> bytes:
     return pack(state)
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize("damage", [lambda held: held + b"\0", without_channels, with_a_broken_clock])
 @pytest.mark.parametrize("command", REFUSED)
 def test_a_recording_whose_snapshot_is_damaged_is_refused_in_one_line(

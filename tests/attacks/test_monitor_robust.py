@@ -96,7 +96,7 @@ def test_a_page_of_malformed_results_hides_none_after_it(site: Site, gateway: Se
         wait_for(lambda: shown(served).get("last") == "VALID")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_hostile_results_names_and_payloads_leave_page_and_threads(
     site: Site, served: Served, gateway: Sender, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -86,6 +86,7 @@ def told(process: subprocess.Popen[str], number: signal.Signals) -> tuple[int, s
     return process.returncode, said
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize("what", CALLS)
 def test_a_signal_ends_a_start_and_its_router_within_two_seconds(tmp_path: Path, what: str) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"

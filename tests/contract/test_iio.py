@@ -242,6 +242,7 @@ class TestTogether:
     def rig(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[IioRig]:
         yield from installed(UnstampedRig(tmp_path, together=16), monkeypatch)
 
+    @pytest.mark.slow
     def test_each_lot_is_a_burst_with_its_arrival(self, rig: IioRig) -> None:
         rig.rate_hz, rig.sensor = 200.0, rig.build(rate_hz=200.0)  # type: ignore[assignment]
         rig.open()

@@ -75,6 +75,7 @@ class TestLis3dh(I2cContract):
         assert after[0] > before[-1] + 20
         assert (np.diff(after) == 1).all()
 
+    @pytest.mark.slow
     def test_a_part_that_samples_faster_than_stated_loses_nothing_unnoticed(self, rig: Lis3dhRig) -> None:
         # 9 % faster; the process does not get the processor between level and data, for 0 to 80 ms.
         class Stalling(Lis3dhTwin):

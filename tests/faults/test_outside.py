@@ -12,13 +12,14 @@ from tests.faults.needs import require
 pytestmark = pytest.mark.faults
 
 
-def test_unplugged(tmp_path: Path) -> None:
-    outcome = unplug.unplugged(tmp_path, 6)
+# The longest of all: begun first.
+def test_router_away(tmp_path: Path) -> None:
+    outcome = routing.away(tmp_path, 300, 20)
     assert outcome.good, outcome
 
 
-def test_router_away(tmp_path: Path) -> None:
-    outcome = routing.away(tmp_path, 300, 20)
+def test_unplugged(tmp_path: Path) -> None:
+    outcome = unplug.unplugged(tmp_path, 6)
     assert outcome.good, outcome
 
 

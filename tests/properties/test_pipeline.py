@@ -30,7 +30,7 @@ def test_restored_at_any_event_it_goes_on_alike_and_its_results_follow_from_each
 
 
 @pytest.mark.thorough
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(seed=seeds, reference=st.booleans())
 @example(seed=35, reference=True)  # five calibrations, too
 def test_so_it_is_with_more_seeds(seed: int, reference: bool) -> None:

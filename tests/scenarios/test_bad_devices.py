@@ -180,6 +180,7 @@ FAULTS = [
 ]
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(("old", "new", "named"), FAULTS, ids=[named for _, _, named in FAULTS])
 def test_a_faulty_configuration_is_refused_with_path_and_value(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], old: str, new: str, named: str

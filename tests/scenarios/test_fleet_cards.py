@@ -306,6 +306,7 @@ def test_a_page_hears_its_monitor_while_nothing_changes(
         watched.close()
 
 
+@pytest.mark.thorough
 def test_a_page_whose_monitor_hangs_looks_old_and_goes_on_when_it_answers_again(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:

@@ -17,6 +17,7 @@ from tests.scenarios.processes import ROOT, fieldcal, interrupt, started, wait_u
 from tests.unit.results import calibration, status
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize("command", ["replay", "audit"])
 def test_a_recording_that_is_no_file_is_bad_input(tmp_path: Path, command: str) -> None:
     pipe = tmp_path / "pipe.mcap"

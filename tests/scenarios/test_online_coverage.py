@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from benchmarks.online import coverage
 from benchmarks.online.node import Timing, node
 from benchmarks.online.runner import EPOCH_NS, Run, visits
 from calib.distributions import chi2_quantile
+from calib.model import Array
 
 RUNS = 12
 
@@ -56,6 +59,21 @@ def _within(n: int, low: int, high: int, share: float) -> float:
     return float(np.mean((draws >= low) & (draws <= high)))
 
 
+@cache
+def first_window(seed: int) -> Array | None:
+    """Errors over u of the main sensitivities that the first window of a life determines; None where it is refused."""
+    drawn = node(seed, all_axes=True, timing=Timing(20.0, 60.0, 1))
+    run = Run(drawn.config)
+    results = [r for event in visits(drawn.building, range(1)) for r in run.feed(event)]
+    update = next((r for r in results if isinstance(r, CalibrationUpdate)), None)
+    if update is None:
+        return None
+    truth = drawn.building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9).sensitivity
+    u = np.reshape(update.standard_uncertainty[:9], (3, 3))
+    known = np.array(update.determined)[[0, 4, 8]]
+    return np.asarray(np.diag((np.array(update.sensitivity) - truth) / u)[known])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("lives", "least", "most"), [(40, 0.80, 1.12), pytest.param(80, 0.83, 1.08, marks=pytest.mark.thorough)]
@@ -66,19 +84,7 @@ def test_the_first_window_alone_is_as_uncertain_as_it_says(lives: int, least: fl
     The rms of three errors a life divided by u must be 1; by chance that of 80 lives differs by 4 %, that of 40 by
     6 %. One weak window alone may not tell a response that settles; it is refused then.
     """
-    errors, refused = [], 0
-    for seed in range(lives):
-        drawn = node(seed, all_axes=True, timing=Timing(20.0, 60.0, 1))
-        run = Run(drawn.config)
-        results = [r for event in visits(drawn.building, range(1)) for r in run.feed(event)]
-        update = next((r for r in results if isinstance(r, CalibrationUpdate)), None)
-        refused += update is None
-        if update is None:
-            continue
-        truth = drawn.building.truth((update.t_utc_ns - EPOCH_NS) * 1e-9).sensitivity
-        u = np.reshape(update.standard_uncertainty[:9], (3, 3))
-        known = np.array(update.determined)[[0, 4, 8]]
-        errors.append(np.diag((np.array(update.sensitivity) - truth) / u)[known])
+    errors = [found for seed in range(lives) if (found := first_window(seed)) is not None]
     rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
     assert least < rms < most
-    assert refused <= 2
+    assert len(errors) >= lives - 2

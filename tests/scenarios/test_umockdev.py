@@ -189,6 +189,7 @@ def test_a_run_loses_no_sample_of_any_device(tmp_path: Path, site: UmockdevSite,
         assert len(numbers) > 4 * rate_hz, name  # of 6 s; the rest is the opening of the devices and the last block
 
 
+@pytest.mark.thorough
 def test_unplugged_and_back_it_goes_on(tmp_path: Path, site: UmockdevSite, bus: I2CBus, port: PtyDevice) -> None:
     data_dir = tmp_path / "data"
     process = program(site, "run", configuration(tmp_path, port), "--data-dir", data_dir)

@@ -52,18 +52,20 @@ def test_one_alpha_is_refused_with_the_rank():
     assert "rank 2 of 4" in _only_reason(found)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("priors", [Priors(), Priors.none(), _nominal()])
 def test_z_outward_with_the_printed_signs_names_the_sign(priors):
     windows = _turned(clamp_points(np.random.default_rng(3), ORDINARY).windows, static=-1.0)
     assert "the static sign (gravity) reversed" in _only_reason(adjust(windows, priors))
 
 
+@pytest.mark.slow
 def test_a_reference_with_turned_polarity_is_named_where_the_sensor_is_known():
     windows = _turned(clamp_points(np.random.default_rng(4), ORDINARY).windows, polarity=-1.0)
     assert "the polarity of the reference reversed" in _only_reason(adjust(windows, _nominal()))
 
 
+@pytest.mark.slow
 def test_both_turned_are_named_where_the_sensor_is_known():
     windows = _turned(clamp_points(np.random.default_rng(5), ORDINARY).windows, static=-1.0, polarity=-1.0)
     assert "the static sign and the polarity" in _only_reason(adjust(windows, _nominal()))
@@ -160,7 +162,7 @@ def _reference_times(windows: list[Window], factor: float) -> list[Window]:
 
 
 @pytest.mark.one_case
-@pytest.mark.parametrize("factor", [2.0, 0.8, 1.2])
+@pytest.mark.parametrize("factor", [1.2, 0.8, 2.0])
 def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(factor):
     windows = _reference_times(clamp_points(np.random.default_rng(20), ORDINARY).windows, factor)
     reason = _only_reason(adjust(windows))

@@ -80,6 +80,7 @@ def test_verdicts_of_earlier_runs_are_remembered() -> None:
     assert report(health, 1.0).sensors["mems"].drifts == {"Sxx": "drifting"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(PROMTOOL is None, reason="promtool is not installed (Debian's package prometheus)")
 def test_the_rules_by_promtool() -> None:
     done = subprocess.run([str(PROMTOOL), "test", "rules", "fieldcal.test.yml"], cwd=GRAFANA, capture_output=True,

@@ -57,6 +57,7 @@ def test_a_constant_lag_is_no_drift() -> None:
     assert abs(found.rate) < 5 * found.u_rate
 
 
+@pytest.mark.slow
 def test_stated_uncertainties_are_those_of_the_scatter() -> None:
     # 60 recordings: the ratio of scatter to stated u is within the 99.9 % band of chi with 59 degrees of freedom.
     z_lag, z_rate = [], []
@@ -108,6 +109,7 @@ def tables(ppm: float) -> tuple[SensorTable, ReferenceTable, list[PoseInterval]]
     return sensor, reference, [PoseInterval(60.0 * k, 60.0 * (k + 1), p) for k, p in enumerate(poses)]
 
 
+@pytest.mark.slow
 def test_free_running_clocks_cost_nothing_once_aligned() -> None:
     sensor, reference, poses = tables(40.0)  # 7 ms apart in the end
     front = Tables(sensor, reference, poses, Instrument())
@@ -139,7 +141,13 @@ APART = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reference", ["dc", pytest.param("ac", marks=pytest.mark.thorough)])
-@pytest.mark.parametrize(("minutes", "to_hz", "ppm", "lag_s"), APART.values(), ids=APART)
+@pytest.mark.parametrize(
+    ("minutes", "to_hz", "ppm", "lag_s"),
+    [
+        pytest.param(*values, id=name, marks=[pytest.mark.thorough] if values[0] > 10 else [])
+        for name, values in APART.items()
+    ],
+)
 def test_clocks_that_run_apart_beside_a_lag(
     minutes: int, to_hz: float, ppm: float, lag_s: float, reference: str
 ) -> None:

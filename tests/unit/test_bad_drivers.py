@@ -274,6 +274,7 @@ def written(tmp_path: Path, bug: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bug", "says"),
     [

@@ -47,6 +47,7 @@ def blocks_of(sensor: Adxl355, number: int) -> list[SampleBlock]:
     return [block for block in found if block is not None]
 
 
+@pytest.mark.slow
 def test_the_driver_gets_the_benchs_counts_from_its_zero_on() -> None:
     clock = HandClock()
     with LiveBench(faulty(2), 2, clock=clock) as live:
@@ -72,6 +73,7 @@ def test_the_driver_gets_the_benchs_counts_from_its_zero_on() -> None:
         assert late_s.max() < 1 / 1013 + 1.5e-3
 
 
+@pytest.mark.slow
 def test_the_chips_temperature_is_the_benchs() -> None:
     clock = HandClock()
     with LiveBench(faulty(2), 2, clock=clock) as live:

@@ -72,6 +72,7 @@ def test_white_noise_has_its_sd_and_is_white() -> None:
     assert abs(np.corrcoef(drawn_first, reference)[0, 1]) < 4 / np.sqrt(BLOCK)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phi", [0.5, 0.99])
 def test_coloured_noise_is_ar1_across_blocks(phi) -> None:
     sensor = SensorParameters(coloured_noise_mps2=0.1, coloured_phi=phi)

@@ -153,6 +153,7 @@ def test_offset_by_position_in_output_unit_and_repeated() -> None:
     assert_allclose(Bench(shifted, 1).truth.offset_by_position, 100 * offsets)
 
 
+@pytest.mark.slow
 def test_offset_by_window_is_constant_in_a_window_and_has_the_stated_sd() -> None:
     schedule = Schedule((clamped(35, 0, 0.5), clamped(35, 120, 0.5)), turn_s=0.5, start_s=0.0)
     base = BenchParameters(schedule=schedule)

@@ -99,6 +99,7 @@ def test_a_velocity_reference_is_differentiated(tmp_path: Path, capsys: pytest.C
     assert errors(found, bench)[0] < 0.02
 
 
+@pytest.mark.slow
 def test_a_tri_axial_reference_needs_no_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     p = plain(7)
     directions = [directed(d, np.array(g), 8.0) for d in np.eye(3) for g in ([0.0, 0.0, 9.80665], [0.0, -9.80665, 0.0])]

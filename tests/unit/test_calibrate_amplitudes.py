@@ -84,6 +84,7 @@ def test_method_2_finds_main_sensitivities_within_u(tmp_path: Path, capsys: pyte
     assert "rel_S_pct" not in found["statistics"]
 
 
+@pytest.mark.slow
 def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files(tmp_path, ON_CLAMP)
     status, found, said = run(tmp_path, capsys, 1)
@@ -107,6 +108,7 @@ def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.C
     assert (status, "windows can be used" in said) == (3, True)
 
 
+@pytest.mark.slow
 def test_an_earlier_result_is_a_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files(tmp_path, ON_AXES)
     _, earlier, _ = run(tmp_path, capsys, 1)

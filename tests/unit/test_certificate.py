@@ -96,6 +96,7 @@ def test_the_dcc_holds_what_the_result_holds(made: Path) -> None:
     assert [node.text for node in root.iter(f"{{{DCC}}}conformity")] == ["pass"] * 3
 
 
+@pytest.mark.slow
 def test_the_order_of_elements_is_that_of_the_schema(made: Path) -> None:
     """The sequences of DCC 3.2.1, as its schema states them; a validator refuses any other order."""
     root = ET.parse(made / "certificate.xml").getroot()
@@ -126,6 +127,7 @@ def test_the_order_of_elements_is_that_of_the_schema(made: Path) -> None:
     assert seen == set(sequences)
 
 
+@pytest.mark.slow
 def test_every_signature_is_over_the_stated_bytes(made: Path, key: tuple[Path, Ed25519PrivateKey]) -> None:
     public = key[1].public_key()
     body, signature = signed_json((made / "certificate.json").read_bytes())
@@ -149,6 +151,7 @@ def check(signature: SignedText, public: Any, number: str, parts: dict[str, byte
     assert told == [number, *(hashlib.sha256(part).hexdigest() for part in parts.values())]
 
 
+@pytest.mark.slow
 def test_the_page_loads_nothing_and_states_the_clauses(made: Path) -> None:
     seen = Page(made / "certificate.html")
     pictures = [link for link in seen.links if link.startswith("data:image/svg+xml;base64,")]
@@ -167,7 +170,7 @@ def test_the_page_loads_nothing_and_states_the_clauses(made: Path) -> None:
         assert words in seen.text, words
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_pdf_has_two_pages_and_is_the_same_each_time(
     made: Path, key: tuple[Path, Ed25519PrivateKey], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -270,6 +273,7 @@ SCHEMA = """<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" targetNamespa
  <xs:attribute name="schemaVersion" use="required"/></xs:complexType></xs:element></xs:schema>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "words"), [(2, ""), (3, "the DCC is not valid: /"), (None, "SI_Format.xsd must be")])
 def test_the_dcc_is_checked_against_a_schema_that_the_user_has(
     count: int | None, words: str, made: Path, tmp_path: Path

@@ -21,6 +21,7 @@ from tests.unit.mounted_site import EPOCH_NS, SECOND, WINDOW_S, Site, begun, sai
 OF_B = S_TRUE * 0.97
 
 
+@pytest.mark.slow
 def test_a_to_b_to_a_goes_on_where_each_was() -> None:
     site = begun(site_config())
     of_a = updates(site.play(4))[-1]
@@ -96,6 +97,7 @@ def test_states_of_many_devices_in_one_place_the_oldest_go() -> None:
     assert list(kept) == ["4", "6", "7", "8", "9", "10", "11", "5"]
 
 
+@pytest.mark.slow
 def test_windows_held_for_a_wrong_reference_go_with_it() -> None:
     site = begun(site_config())
     site.play(3)
@@ -121,6 +123,7 @@ def test_another_reference_after_a_restart_is_not_taken_for_the_one_before(order
         assert len(estimation.state.references) == references
 
 
+@pytest.mark.slow
 def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
     site = begun(site_config())
     before = updates(site.play(4))[-1]
@@ -136,6 +139,7 @@ def test_restored_after_a_kill_it_is_the_calibration_of_before() -> None:
     assert abs(later.sensitivity[1][1] - S_TRUE[1, 1]) < 2e-3
 
 
+@pytest.mark.slow
 def test_a_step_in_a_later_run_is_dated_in_utc() -> None:
     """The estimation counts its days through all runs; here the second one begins on day 30."""
     site = begun(site_config())

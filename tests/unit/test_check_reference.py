@@ -100,6 +100,7 @@ def adopted(results: list[Judged]) -> str:
     return reason
 
 
+@pytest.mark.slow
 def test_each_reference_has_its_own_unknowns_and_priors() -> None:
     found = sound(0.0)
     for place, u in ((FIRST, 0.1), (SECOND, 0.2)):
@@ -198,6 +199,7 @@ def test_a_state_goes_on_bit_for_bit_while_windows_are_held() -> None:
     assert np.array_equal(found.in_force.covariance, again.in_force.covariance)
 
 
+@pytest.mark.slow
 def test_a_restarted_sensor_loosens_the_lag_behind_both_references() -> None:
     found = sound()
     before = u_lags(found)
@@ -219,7 +221,7 @@ def test_a_sensor_that_was_mounted_again_has_another_rotation_to_both() -> None:
         assert found.state.quantity(f"rotation_x of place {place}")[1] >= np.deg2rad(0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_second_reference_can_be_removed_and_added_again() -> None:
     found = sound()
     both, alone = configured(), configured(both=False)

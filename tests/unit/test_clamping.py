@@ -39,6 +39,7 @@ def test_a_good_clamp_has_no_findings():
         assert found.coherence > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "by_deg", [(0.0, 0.0, 5.0), (-7.0, 0.0, 0.0), (3.0, -4.0, 3.0), (0.0, 0.0, 90.0), (180.0, 0, 0)]
 )
@@ -60,6 +61,7 @@ def test_a_clamp_on_a_spring_is_loose():
     assert "loose" in findings(found, "sensor")["loose"]
 
 
+@pytest.mark.slow
 def test_little_motion_is_no_loose_clamp():
     _, found = _seen(Clamped(calm=True), seconds=60.0)
     assert set(findings(found, "sensor")) == {"little motion"}

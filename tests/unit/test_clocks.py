@@ -85,6 +85,7 @@ def test_rate_lateness_and_scatter_are_those_of_the_simulated_devices() -> None:
     assert chi2_quantile(0.001, 16) < np.sum(np.square(deviations)) < chi2_quantile(0.999, 16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [0.0, 5e-3, -12e-3])
 def test_the_lag_is_that_of_the_sensor_behind_the_reference(lag_s: float) -> None:
     late_s = np.random.default_rng(1).exponential(1e-4, (2, 6500))
@@ -105,6 +106,7 @@ def test_a_lag_that_no_window_told_is_unknown() -> None:
         assert (report.device, math.isnan(report.lag_s), math.isnan(report.u_lag_s)) == ("s", True, True)
 
 
+@pytest.mark.slow
 def test_each_device_that_speaks_is_reported_once_a_minute_of_the_run() -> None:
     found = pipeline(reference=True, rate_hz=100.0)
     reports = clocks(found, both(190.0))

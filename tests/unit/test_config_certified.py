@@ -29,7 +29,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", ["certificate.xml", "certificate.json", "result.json"])
 def test_the_prior_is_what_the_file_states_and_a_recording_carries_it(made: Path, tmp_path: Path, name: str) -> None:
     file = tmp_path / name
@@ -66,6 +66,7 @@ def test_the_reference_has_the_mean_main_sensitivity_its_number_and_its_date(
     assert channel.certificate.stability_pct == 0.25
 
 
+@pytest.mark.slow
 def test_faults_have_their_lines(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, xml = tmp_path / "gateway.toml", made / "certificate.xml"
     (tmp_path / "bad.xml").write_bytes(b"<!DOCTYPE x>" + xml.read_bytes())

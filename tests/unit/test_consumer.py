@@ -106,6 +106,7 @@ def test_a_first_meeting_begins_with_the_values_in_force_then_all(site: Site, ga
     follower.stop()
 
 
+@pytest.mark.slow
 def test_who_knows_a_number_gets_all_that_came_after_it(site: Site, gateway: Gateway) -> None:
     gateway.send(1200)
     gateway.publisher.start()
@@ -214,6 +215,7 @@ def test_a_gateway_that_did_not_answer_is_asked_again(site: Site) -> None:
     follower.stop()
 
 
+@pytest.mark.slow
 def test_what_is_no_result_is_passed_over(site: Site, gateway: Gateway) -> None:
     gateway.publisher.start()
     wait_for(lambda: gateway.publisher.state().connected)

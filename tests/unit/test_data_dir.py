@@ -41,6 +41,7 @@ def test_what_takes_files_takes_a_data_directory_by_its_option(
     assert len(one.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_the_option_and_the_directory_audit_the_same(capsys: pytest.CaptureFixture[str]) -> None:
     one, other = ((run_cli(["audit", *given]), capsys.readouterr().out)
                   for given in ([str(PRESENT)], ["--data-dir", str(PRESENT)]))  # fmt: skip

@@ -47,6 +47,7 @@ def together(records: int, seed: int, narrow: float = 0.0) -> Deviations:
     return reduce(Deviations.plus, (of_lorries(random, narrow).deviations for _ in range(records)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 def test_noise_that_comes_with_the_motion_is_no_other_response(seed: int) -> None:
     """The slopes of bands scatter more than in steady noise, and with 20 windows chance does not explain that."""

@@ -213,7 +213,7 @@ def test_a_noisy_reference_on_a_structure() -> None:
     assert_rms(float(np.mean(rms)), 100.0 * errors.ravel())
 
 
-@pytest.mark.one_case
+@pytest.mark.thorough
 @pytest.mark.parametrize("line", [0, 2])
 def test_one_frequency(line: int) -> None:
     motion_hz, corner_hz, order = one_frequency.LINES[line]

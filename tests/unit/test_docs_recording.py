@@ -94,7 +94,7 @@ def test_s_by_plain_least_squares_is_the_published_one(
     assert re.fullmatch(r"[\d.]+ published: [\d.]+ u: [\d.]+\n", capsys.readouterr().out)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("right", "wrong"),
     [

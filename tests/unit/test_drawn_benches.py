@@ -91,7 +91,7 @@ def beyond(seed: int) -> float | None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [*range(1, 8), pytest.param(0, marks=pytest.mark.thorough)])  # 0: ten seconds
+@pytest.mark.parametrize("seed", [*range(1, 5), *(pytest.param(k, marks=pytest.mark.thorough) for k in (0, 5, 6, 7))])
 def test_a_drawn_bench_is_within_4_u(seed: int) -> None:
     largest = beyond(seed)
     assert largest is not None
@@ -99,10 +99,10 @@ def test_a_drawn_bench_is_within_4_u(seed: int) -> None:
 
 
 @pytest.mark.thorough
-def test_few_of_ten_benches_are_refused_or_beyond_4_u() -> None:
+def test_few_of_six_benches_are_refused_or_beyond_4_u() -> None:
     """The limits are what was seen, with a margin: by chance alone 0.02 of them would be beyond 4 u."""
-    largest = [beyond(seed) for seed in range(9, 68, 6)]
+    largest = [beyond(seed) for seed in range(9, 68, 10)]
     told = np.array([one for one in largest if one is not None])
-    assert len(told) >= 9
+    assert len(told) >= 5
     assert (told > 4.0).sum() <= 1
     assert told.max() < 7.5

@@ -68,6 +68,7 @@ def test_as_long_as_no_window_tells_the_rate_u_grows_by_it() -> None:
     assert after - before == pytest.approx((100 * RATE) ** 2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_state_with_a_rate_of_s_goes_on_from_its_snapshot() -> None:
     found = told_of_a_drift(range(1, 5), rates(SYY))
     again = told_of_a_drift(range(0), rates())

@@ -26,6 +26,7 @@ def test_the_program_knows_the_engines_of_the_table() -> None:
     )
 
 
+@pytest.mark.slow
 @with_history
 def test_an_engine_has_the_known_bytes_wherever_and_however_often_it_is_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

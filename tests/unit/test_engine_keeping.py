@@ -21,6 +21,7 @@ def kept(directory: Path) -> Path:
     return directory / ENGINES / file_name(engine_id())
 
 
+@pytest.mark.slow
 def test_wheel_is_written_once_and_found_by_an_audit(tmp_path: Path) -> None:
     sha256 = keep_engine(tmp_path)
     path = kept(tmp_path)
@@ -75,6 +76,7 @@ def test_disk_that_is_full_is_left_as_it_was(tmp_path: Path, caplog: pytest.LogC
     assert os.listdir(tmp_path / ENGINES) == []
 
 
+@pytest.mark.slow
 def test_release_is_added_to_the_list_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(known, "_LIST", tmp_path / "known.json")
     known.known_engines.cache_clear()

@@ -64,6 +64,7 @@ def process(own: EngineWheel) -> Iterator[EngineProcess]:
         yield engine
 
 
+@pytest.mark.slow
 def test_results_are_those_of_the_pipeline_bit_for_bit(process: EngineProcess) -> None:
     results = 0
     for step in RecordingReader(GOLDEN).steps():
@@ -145,7 +146,7 @@ def test_thread_of_an_engine_is_allowed() -> None:
     assert begun(does + "thread.start()\nthread.join()") == "EngineFaultError: from a thread"
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("does", "limits", "told"),
     [

@@ -133,6 +133,7 @@ def test_nothing_is_merged_across_a_step() -> None:
     assert any(record.windows > 1 for record in few)
 
 
+@pytest.mark.slow
 def test_windows_are_brought_to_one_lag_before_they_are_merged() -> None:
     """From half of the windows 0.2 ms more were taken out than from the others."""
     early = [replace(r, temperature_degc=20.0) for r in many(np.random.default_rng(9), 40, 0.0005)]

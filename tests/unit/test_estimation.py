@@ -108,6 +108,7 @@ def test_u_covers_a_step_from_the_window_on_in_which_it_is_found() -> None:
     assert 0.02 < abs(found.in_force.sensitivity[1, 1] - OF_Y[1, 1]) < 2 * found.in_force.standard_uncertainty[4]
 
 
+@pytest.mark.slow
 def test_what_a_certificate_tells_well_is_in_force_from_the_first_window_and_follows_a_jump() -> None:
     # u below half of a certificate's is more than a reference can give: it would be "not determined yet" for ever.
     random = np.random.default_rng(3)
@@ -191,6 +192,7 @@ def test_propose_and_observe_put_nothing_in_force() -> None:
         assert found.state.windows == 6  # the state goes on unseen
 
 
+@pytest.mark.slow
 def test_what_is_accepted_keeps_how_it_goes_with_temperature() -> None:
     random = np.random.default_rng(8)
     found = estimation(gate={"policy": "propose"}, uncertainty={"offset_mps2": 0.001})

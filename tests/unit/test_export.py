@@ -185,6 +185,7 @@ def test_miniseed_has_each_block_at_its_own_time(
     np.testing.assert_allclose(a @ np.transpose(newest.sensitivity) + newest.offset, truth[1], rtol=1e-9, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_reference_is_one_column(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "out.csv"
     assert run(capsys, recorded, "--to", path, "--device", "reference") == (0, "")
@@ -241,6 +242,7 @@ def plots(recorded: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_plots_are_means_at_the_stated_rate(plots: Path, truth: tuple[np.ndarray, np.ndarray], recorded: Path) -> None:
     found: dict[str, list[tuple[int, dict[str, Any]]]] = {}
     for topic, t_utc_ns, content in messages(plots):

@@ -93,7 +93,7 @@ def install(part: parts.Extra, directory: Path) -> subprocess.CompletedProcess[s
     return subprocess.run([*command, "--target", directory / "installed"], capture_output=True, text=True, check=False)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_wheels_beside_it_are_enough(part: parts.Extra, tmp_path: Path) -> None:
     """The command installs the wheel, into a directory of its own and without any index."""
     done = install(part, tmp_path)

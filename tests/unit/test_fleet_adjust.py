@@ -121,7 +121,7 @@ def test_the_reference_that_contradicts_the_others_is_named(
     assert "most suspect: ref 3" in out
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("changed", "by", "fault"),
     [
@@ -209,7 +209,7 @@ def test_one_link_alone_is_what_calibrate_finds(tmp_path: Path) -> None:
     assert np.array(found["covariance"]) == pytest.approx(np.array(alone["covariance"]), rel=1e-3, abs=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_recordings_need_no_list_of_meetings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = record(tmp_path, 130.0)
     (recording,) = tmp_path.glob("*.mcap")

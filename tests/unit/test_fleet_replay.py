@@ -78,7 +78,7 @@ def written(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_one_bad_file_is_told_and_the_others_have_the_same_bits_with_one_and_two_processes(
     recordings: Path, tmp_path: Path
 ) -> None:
@@ -179,7 +179,7 @@ def run_or_end(task: Task) -> bytes:
     return run_task(task)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_file_that_ends_its_process_is_refused_alone(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,6 +253,7 @@ def test_what_names_no_recording_is_bad_usage(tmp_path: Path) -> None:
         assert (done.return_value, str(name) in done.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_directories_patterns_and_files_name_each_recording_once(recordings: Path) -> None:
     three = [str(recordings / f"gateway-{seed}.mcap") for seed in (1, 2, 3)]
     assert recordings_in([f"{recordings}/gateway-*.mcap", three[0]]) == three

@@ -60,7 +60,7 @@ def run(directory: Path, rows: list[Any], *options: str) -> Result:
     return CliRunner().invoke(fleet, ["watch", str(file), *options], standalone_mode=False)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     told = run(tmp_path, clean, "--json", "-")
     assert told.exception is None
@@ -104,6 +104,7 @@ def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, cl
         assert np.allclose(other["least_detectable_pct"], one["least_detectable_pct"], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_nulls_other_grids_and_sensors_that_come_and_go(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     rows = [dict(row) for row in clean if row["sequence"] < 24 * CHANGED]
     rows = [row for row in rows if row["sensor"] != "f" or row["sequence"] > 24 * 20]
@@ -124,6 +125,7 @@ def test_nulls_other_grids_and_sensors_that_come_and_go(tmp_path: Path, clean: l
     assert "no sensor stands beside a reference" in told.output
 
 
+@pytest.mark.slow
 def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     rows = [dict(row) for row in clean]
     for row in rows:
@@ -134,7 +136,7 @@ def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[di
     assert "learning" in next(line for line in told.output.splitlines() if line.startswith("middle/c"))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_users_meet(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     """From some day on at one sensor: x and y exchanged, twice the sensitivity, dead outputs; wrong units at a gateway;
     lines of another site among the others."""
@@ -177,7 +179,7 @@ def test_what_users_meet(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     assert [each["sensor"] for each in mixed["sensors"]] == list("abcde")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_visit_says_what_it_found_where_the_calibrations_are_told(
     tmp_path: Path, clean: list[dict[str, Any]]
 ) -> None:
@@ -252,6 +254,7 @@ def as_line(result: SelfTestReport, gateway: str) -> dict[str, Any]:
     return dict(msgspec.json.decode(msgspec.json.encode(result)) | {"gateway": gateway})
 
 
+@pytest.mark.slow
 def test_recordings_say_the_same_as_lines(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     few = [row for row in clean if row["sequence"] < 24 * 3]
     tests = [as_line(self_test(row, row["sequence"]), row["gateway"]) for row in few if row["sequence"] % 24 == 3]
@@ -316,6 +319,7 @@ def test_bad_files_and_options(tmp_path: Path, clean: list[dict[str, Any]]) -> N
     assert "learning" in known.output
 
 
+@pytest.mark.slow
 def test_a_reference_shows_what_all_others_share(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     rows = [dict(row) for row in clean if row["sensor"] != "c"]
     for row in rows:

@@ -157,6 +157,7 @@ def test_a_configuration_states_its_key_itself(place: Path, capsys: pytest.Captu
     assert not key.exists()
 
 
+@pytest.mark.slow
 def test_a_run_tells_where_its_key_is_misplaced(place: Path) -> None:
     config, data = place / "gateway.toml", place / "data"
     assert run_cli(["init", str(config), *STATED, "--signing-key", str(data / "a.key")]) == 0

@@ -134,6 +134,7 @@ def test_what_is_said_long_and_often_stays_within_the_message() -> None:
     assert read.ending.status == "no result"
 
 
+@pytest.mark.slow
 def test_a_guide_reaches_a_monitor_that_comes_later_and_one_behind_a_new_router(site: Site, tmp_path: Path) -> None:
     pytest.importorskip("starlette", reason="the extra monitor is not installed")
     pytest.importorskip("uvicorn", reason="the extra monitor is not installed")

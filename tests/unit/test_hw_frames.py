@@ -190,6 +190,7 @@ frames_of_wit = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(st.lists(frames_of_wit, max_size=8).map(b"".join), max_size=6))
 def test_any_bytes_pass_through_the_witmotion_stream(bursts: list[bytes]) -> None:
     stream = WitStream(Cutter("s", 200.0), 200.0)
@@ -208,7 +209,7 @@ frames_of_binary = st.one_of(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "changes",
     [

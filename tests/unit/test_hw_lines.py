@@ -71,6 +71,7 @@ lines = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(lines, min_size=1, max_size=40), st.sampled_from([b"\n", b"\r\n", b"\r"]))
 def test_as_a_plain_reading_line_by_line(texts: list[bytes], ending: bytes) -> None:
     decoded = decode(with_newlines(b"".join(line + ending for line in texts)), 3)

@@ -199,6 +199,7 @@ def test_an_existing_file_is_never_overwritten(capsys: pytest.CaptureFixture[str
     assert path.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_questions_are_asked_on_a_terminal_only(tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"
     options = ["--sensor", "adxl355", "--reference-port", "/dev/nowhere", *stated("reference", *LINES)]

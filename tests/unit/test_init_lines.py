@@ -91,7 +91,7 @@ DECIDED: dict[str, tuple[Callable[[int], str], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", DECIDED)
 def test_what_init_writes_is_read_without_a_loss(name: str, tmp_path: Path) -> None:
     line, options = DECIDED[name]
@@ -117,6 +117,7 @@ def test_what_init_writes_is_read_without_a_loss(name: str, tmp_path: Path) -> N
     assert {tuple(row) for block in blocks for row in block.indications.tolist()} == {(0.12, -0.05, 9.8)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "count"),
     [

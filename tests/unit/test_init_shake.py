@@ -96,6 +96,7 @@ def test_an_old_one_with_one_geophone_beside_a_barometer(tmp_path: Path) -> None
     assert config.channels[0].rotation is None
 
 
+@pytest.mark.slow
 def test_channels_of_which_nobody_can_say_which_are_meant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "gateway.toml"
     with shake((*GEOPHONES, *ACCELEROMETERS)) as port:

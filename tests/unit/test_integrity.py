@@ -270,6 +270,7 @@ def test_mutated_files_are_refused_cleanly(recording: bytes, tmp_path: Path) -> 
         assert all(step.event_sequence == number for number, step in enumerate(steps))
 
 
+@pytest.mark.slow
 def test_mutated_messages_in_sound_files_are_refused_cleanly(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     events = [run_start(StandIn(CONFIG), 0, 1), *happenings(5, seed=1)]

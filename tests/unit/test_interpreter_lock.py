@@ -11,6 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.unit.zenoh_site import Site
 
 END_S = 60.0  # a program here takes a second
@@ -75,9 +77,11 @@ def printed(program: str, *arguments: object) -> str:
     return subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=END_S, check=True).stdout
 
 
+@pytest.mark.slow
 def test_no_thread_of_zenoh_waits_for_the_interpreter_while_a_router_answers(site: Site) -> None:
     assert printed(_HEARING, site.endpoint) == "ended\n"
 
 
+@pytest.mark.slow
 def test_publishers_are_undeclared_without_the_lock_of_the_interpreter(site: Site, tmp_path: Path) -> None:
     assert printed(_PUBLISHER, site.endpoint, tmp_path) == "True\n"

@@ -101,6 +101,7 @@ def test_faults_are_told_with_their_lines(tmp_path: Path, capsys: pytest.Capture
         assert f"line {lines.index(line) + 1}:" in row
 
 
+@pytest.mark.slow
 def test_a_restored_state_goes_on_bit_for_bit() -> None:
     drawn = node(SEED, all_axes=True, stated=Stated(lag_s=0.01), timing=Timing(20.0, 60.0, 4))
     config = stating(drawn.config, prior=NEAR_TEXT, certificate=["flat"])

@@ -175,6 +175,7 @@ def calibrated(*options: str, to: Path) -> dict[str, Any]:
     return dict(json.loads(to.read_text()))
 
 
+@pytest.mark.slow
 def test_the_table_of_a_certificate(files: tuple[list[str], Pair, Filter], tmp_path: Path) -> None:
     options, made, response = files
     path = certificate(tmp_path, response)

@@ -121,7 +121,7 @@ def stretches(number: int, rate: float, lag_s: float, kept: list[weakref.ref[np.
         del V, u
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("rate", "lag_s"), [(0.0, -0.09), (1.5e-4, 0.05), (-5e-5, 0.0)])
 def test_clocks_that_run_apart_are_found_by_correlation_without_holding_all_samples(rate: float, lag_s: float) -> None:
     kept: list[weakref.ref[np.ndarray]] = []
@@ -168,6 +168,7 @@ def test_beside_turns_against_gravity_clocks_that_run_apart_are_found(rate: floa
     )  # of a period a sixteenth, of a sample a quarter
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("upper", "lag_s", "noise_mps2", "bursts"), [(1.6, 0.017, 0.01, True), (3.0, 0.0125, 0.035, False)]
 )

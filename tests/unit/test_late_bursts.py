@@ -41,6 +41,7 @@ def test_every_window_is_used_right_and_tells_how_many_samples_were_late(device:
     assert np.max(np.abs(error) / update.standard_uncertainty) < 3.5  # 12 errors: beyond in one of 180 runs
 
 
+@pytest.mark.slow
 def test_of_a_window_in_which_samples_are_lost_uncounted_the_longest_part_is_used() -> None:
     drawn = node(3, all_axes=True, stated=Stated(lag_s=0.02), timing=Timing(WINDOW_S, 0.0, WINDOWS))
     run, results = Run(drawn.config), list[Result]()

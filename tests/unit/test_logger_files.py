@@ -256,7 +256,9 @@ FAULTS = (no_end, cut_line, zeros_behind, zeros_within, no_time, missing_cells, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize(
+    "dialect", [pytest.param(d, marks=[pytest.mark.thorough] * (k % 3 > 0)) for k, d in enumerate(DIALECTS)]
+)
 def test_faults(dialect: str, fault: Callable[[Written, list[str]], Wrong | None], tmp_path: Path) -> None:
     way = DIALECTS[dialect]
     wrong = fault(way, rows(way.row, STEP_S))

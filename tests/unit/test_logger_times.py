@@ -131,6 +131,7 @@ def test_offsets_from_utc(zone: str, east_h: float, tmp_path: Path) -> None:
     np.testing.assert_allclose(found.time_s[:1][0], APRIL_3 + 43200 - 3600 * east_h, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", ["", HEADER, "Logger 7\nstarted 2023-11-14 10:05:00\n" + HEADER])
 def test_a_restart_makes_pieces(head: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = "Logger 7\nstarted 2023-11-14 10:00:00\n" + table(lambda k: f"{k / 100:.2f}")

@@ -107,6 +107,7 @@ def test_results_of_one_batch_are_kept_as_one_by_one(kept: Kept) -> None:
     assert kept.database.last_sequence() == {"site/gw/ab": 4, "site/gw": 5}
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_set_late_costs_no_result_that_lasts(kept: Kept) -> None:
     """A machine without a battery for its clock begins in 1970, the day that marks what lasts."""
     kept.now_ns = HOUR_NS

@@ -37,6 +37,7 @@ def verdict(**more: Any) -> dict[str, Any]:
     return fields_of(made, **more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["drifting", "stepped"])
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
 def test_the_interval_of_an_onset_has_it(shape: Literal["drifting", "stepped"], correlation: float) -> None:

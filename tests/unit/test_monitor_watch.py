@@ -159,6 +159,7 @@ def test_the_monitor_says_what_the_files_say_and_what_it_said_lasts(tmp_path: Pa
         assert fleet.alarms() == []
 
 
+@pytest.mark.slow
 def test_self_tests_are_in_the_sum_of_their_day(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
     few = [row for row in rows if row["sequence"] < 24 * 3 and row["gateway"] == "north"]
     database = Database(engine, now_ns=lambda: NOW_NS)
@@ -278,6 +279,7 @@ def test_what_a_database_is_not(tmp_path: Path, rows: list[dict[str, Any]]) -> N
     assert "no database of the monitor" in refused(str(file))
 
 
+@pytest.mark.thorough
 def test_a_change_is_not_told_before_its_day_has_closed(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
     """And a site rests after it was asked, so that a history that comes at once is not asked for each of its days."""
     clock = [0.0]

@@ -57,6 +57,7 @@ def test_motion_across_is_no_response_over_frequency() -> None:
         assert one.relative_u < 0.03, seed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [False, True], ids=["as it stands", "outputs exchanged"])
 def test_response_is_told_as_well_by_the_output_along_the_motion(turned: bool) -> None:
     """Without motion across, the response is told to the same from one output as from three, also where the outputs are
@@ -82,6 +83,7 @@ def test_a_windows_bands_are_those_along_its_motion() -> None:
     assert data.bands.between.relative_u < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("across", [0.0, 0.3])
 def test_calibrate_counts_the_motion_across_that_the_sensor_shows(across: float) -> None:
     """With the default of 1 %: S of a sensor along z, of which the outputs x and y show motion across. What it tells of
@@ -162,7 +164,7 @@ def test_a_bridge_beside_a_vertical_reference_is_calm_where_its_motion_across_is
     assert u[8] < 0.003
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_motion_across_that_is_not_stated_is_named_and_not_an_inverted_output() -> None:
     reasons = hours(1.0).gateway.reasons
     assert any("moves across the reference" in reason and "transverse_motion_pct to" in reason for reason in reasons)

@@ -48,6 +48,7 @@ def test_a_direction_in_which_nothing_moves_shows_noise() -> None:
     assert not moving_share(u, V, RATE_HZ, (15.0, 60.0), 0).any()
 
 
+@pytest.mark.slow
 def test_a_weak_axis_beside_motion_of_all_frequencies_is_within_u() -> None:
     """The floor is weaker than the sensor's noise. Counted as noise of the reference, it makes S_zz 1.7 % larger."""
     errors = []

@@ -34,7 +34,7 @@ def relative(made: Pair, response: Filter, found: Outcome) -> tuple[float, float
     return float(np.abs(np.diag(away)).max()), float(np.nanmax(np.abs(away.ravel()) / found.expanded_uncertainty[:9]))
 
 
-@pytest.mark.one_case
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("response", "skirts"),
     [(lowpass(2, 1.56 * TO_HZ), 2), (resonance(3.0 * TO_HZ, 5.0), 4)],

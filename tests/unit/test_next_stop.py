@@ -59,6 +59,7 @@ def test_the_first_promise_of_a_stop_is_its_information():
     np.testing.assert_allclose(after.expanded[:3], 2.0 * expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_inclinations_need_few_stops_and_one_does_not_get_there():
     two = _session(TWO, STATED)
     assert two.outlook().stops == 8

@@ -30,6 +30,7 @@ def made(disturbed: Disturbance, band_hz: tuple[float, float], seed: int) -> tup
     return of, adjusted(of.files, stated)
 
 
+@pytest.mark.slow
 def test_a_band_with_noise_alone_is_no_motion() -> None:
     """The reference hums at 40 Hz, twice the upper end of the motion, three times as strong as it."""
     of, _ = made(undisturbed, FAST_HZ, 1)

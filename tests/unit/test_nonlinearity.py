@@ -68,6 +68,7 @@ def test_an_output_that_rises_more_than_the_motion_is_refused_as_well() -> None:
     assert found.numbers["nonlinearity_pct"] > found.numbers["nonlinearity_pct_threshold"]
 
 
+@pytest.mark.slow
 def test_the_uncertainty_is_that_of_proportional_outputs() -> None:
     """200 seeds: the rms of value over u is 1 within a quarter, and no window comes near its limit."""
     found = []

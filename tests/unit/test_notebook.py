@@ -64,6 +64,7 @@ def as_csv(path: Path, columns: Columns) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_the_command_gives_the_same_object_to_the_last_bit(result: Outcome, tmp_path: Path) -> None:
     poses = {name: [row[name] for row in POSES] for name in POSES[0]}
     files = [f"--{name}={as_csv(tmp_path / f'{name}.csv', columns)}"
@@ -161,6 +162,7 @@ def test_a_fault_is_named_with_its_place(
     assert (error.value.place, error.value.row, error.value.column) == place
 
 
+@pytest.mark.slow
 def test_a_value_that_is_missing_is_a_gap(result: Outcome) -> None:
     masked = np.ma.MaskedArray(SENSOR["vx"], mask=np.arange(len(SENSOR["vx"])) % 1000 == 500)
     as_nan = SENSOR | {"vx": masked.filled(np.nan)}
@@ -190,7 +192,7 @@ def test_an_earlier_result_is_a_prior_in_any_of_its_forms(result: Outcome) -> No
     assert one != result.to_json()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_data_that_are_refused_are_no_exception() -> None:
     found = calibrate(SENSOR, REFERENCE, POSES, nominal=1.5, u_nominal_pct=1.0)
     assert found.status == "refused"
@@ -284,6 +286,7 @@ def test_warnings_stand_above_the_table(result: Outcome, capsys: pytest.CaptureF
     assert json.loads(warned.to_json())["warnings"] == ["det S is negative", "the reference reads 260 g"]
 
 
+@pytest.mark.slow
 def test_the_figure_shows_s_q_response_and_windows(result: Outcome) -> None:
     figure = result.plot()
     assert [axes.get_title(loc="left").split(":")[0] for axes in figure.axes] == ["S", "Q", "response", "windows"]

@@ -48,6 +48,7 @@ def test_with_a_filter_s_is_right_at_its_frequency_and_q_is_right(
     assert np.abs(np.concatenate(z)).max() < 4.0
 
 
+@pytest.mark.slow
 def test_a_pure_delay_costs_little_and_no_lag_costs_nothing() -> None:
     u = {lag_s: _u_main(lag_s) for lag_s in (0.0, 0.005)}
     assert u[0.0] < 0.0027  # 0.0025 if both instruments were known to respond alike
@@ -124,6 +125,7 @@ def test_the_agent_is_right_at_that_frequency_as_well(seed: int) -> None:
     assert update.valid_band_hz[0] < 6.0 < update.valid_band_hz[1]
 
 
+@pytest.mark.slow
 def test_the_attenuation_is_told_as_such() -> None:
     """The paper's bench with exact angles: a filter of first order at 31 Hz attenuates 3 Hz by 0.47 %."""
     outcome = calibrated(bench(3.0, lowpass_hz=31.0), 2, stated())

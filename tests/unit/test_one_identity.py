@@ -53,6 +53,7 @@ def memories(site: Site) -> dict[str, bytes]:
 # --- in the core
 
 
+@pytest.mark.slow
 def test_after_restarts_it_is_the_calibration_that_was_made() -> None:
     first = begun(site_config())
     made = updates(first.play(4))[-1]

@@ -29,6 +29,7 @@ def test_on_hold_nothing_changes_until_it_is_released() -> None:
     assert updates(site.play(2))[-1].windows > before.windows
 
 
+@pytest.mark.slow
 def test_a_hold_outlives_a_kill() -> None:
     site = begun(site_config())
     site.play(3)
@@ -91,6 +92,7 @@ def test_an_estimate_of_another_device_is_not_there_to_accept() -> None:
     assert reason == f"accept refused: estimate {waiting.sequence} cannot be accepted; estimates that can be: none"
 
 
+@pytest.mark.slow
 def test_rolled_back_it_stays_so_until_released() -> None:
     site = begun(site_config())
     first = updates(site.play(3))[0]

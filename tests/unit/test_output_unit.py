@@ -88,7 +88,7 @@ def words(html: str) -> str:
     return " ".join(re.sub(r"<[^>]*>", " ", html).split())
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("heads", "stated", "unit"),
     [
@@ -108,6 +108,7 @@ def test_the_result_has_the_unit_that_all_three_columns_have(
     assert calibrated(tmp_path, *given)[1]["unit"] == unit
 
 
+@pytest.mark.slow
 def test_the_unit_is_in_table_report_and_certificate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result, told = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
     assert "  S in mV per m/s², Q in mV, U with k = 2" in capsys.readouterr().out
@@ -184,6 +185,7 @@ def test_a_reference_of_velocity_is_a_vibrometer(tmp_path: Path) -> None:
     assert reference_of(named).startswith("laser: Polytec ")
 
 
+@pytest.mark.slow
 def test_a_reference_of_acceleration_is_an_accelerometer(tmp_path: Path) -> None:
     result, _ = calibrated(tmp_path, *files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]")))
     assert reference_of(certificate(tmp_path, result, output_unit="")).startswith("reference accelerometer: PCB ")

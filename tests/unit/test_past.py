@@ -188,6 +188,7 @@ def test_epochs_stand_at_windows_on_both_sides_of_a_change_and_within_long_gaps(
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepped", ["Syy", "Syz"])
 def test_a_change_is_the_difference_of_both_sides(stepped: str) -> None:
     """Of a fixed mount, whose mean output stays: with S_yz, along which gravity acts, Q_y changes as well."""
@@ -225,6 +226,7 @@ def test_between_two_epochs_it_is_on_their_line_as_an_epoch_there_would_be() -> 
     assert past.knows(past.begin - 0.99 * REACH_DAYS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixed", [False, True])
 def test_the_last_epoch_is_the_present(fixed: bool) -> None:
     """Of a fixed mount as well, where Q is read from the mean output: in the past from that of each epoch."""

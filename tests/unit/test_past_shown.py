@@ -114,6 +114,7 @@ def test_recordings_tell_the_same_past_as_the_data_directory(
         assert words in err
 
 
+@pytest.mark.slow
 def test_the_date_of_a_change_is_the_same_in_table_csv_and_json(
     copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -247,6 +248,7 @@ def test_samples_between_two_epochs_are_corrected_by_what_is_between_their_value
     assert smoothed.acceleration("C", V, EPOCH_NS, None) == (None, "no state is kept of the device C")
 
 
+@pytest.mark.slow
 def test_the_kept_state_tells_the_past_beside_a_running_agent(
     kept: Path, copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -261,6 +263,7 @@ def test_the_kept_state_tells_the_past_beside_a_running_agent(
         store.close()
 
 
+@pytest.mark.slow
 def test_a_store_without_a_state_and_a_state_of_an_earlier_version_are_told(
     copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -325,6 +328,7 @@ def test_a_damaged_state_is_one_line(damage: str, copied: Path, capsys: pytest.C
     assert (out + err).count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_recording_that_a_power_cut_tore_is_exported_up_to_there(
     copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -46,6 +46,7 @@ def test_a_mode_is_found_where_it_is_also_at_the_edge_of_a_band(hz: float) -> No
     assert apart.max() < 0.005
 
 
+@pytest.mark.slow
 def test_the_stated_uncertainty_is_the_scatter_of_hours() -> None:
     """40 times 30 minutes, seeds 0 to 39: the ratio of squares is chi-squared over its 39 degrees of freedom, 0.44 to
     1.9 at 99.9 %."""

@@ -83,6 +83,7 @@ def test_a_data_sheet_tells_stops_thirty_degrees_apart_and_never_a_wrong_one() -
     assert told[2.0] == 0
 
 
+@pytest.mark.slow
 def test_sound_windows_are_not_refused() -> None:
     """2000 draws of all that was stated: one in 10,000 may be beyond the chi-squared limit; 3 are beyond 99.9 %."""
     random, known, stop = np.random.default_rng(2), knowing(GOOD), leaning(40.0)

@@ -64,6 +64,7 @@ def test_a_tone_is_told_at_its_own_frequency(starts_and_stops: bool) -> None:
     assert outcome.reference_frequency_hz == pytest.approx(6.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_one_direction_is_named_as_such() -> None:
     world = World("band", directions=1)
     of = made(world, 3)
@@ -81,6 +82,7 @@ def test_planes_that_change_determine_everything_together() -> None:
         assert outcome.standard_uncertainty[:9].max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("third", "determined"), [(1.0, 0), (10.0, 9), (30.0, 9)])
 def test_a_weak_motion_along_the_normal_counts_where_it_is_more_than_noise(third: float, determined: int) -> None:
     world = World("band", third=third)

@@ -81,6 +81,7 @@ def windows(values: np.ndarray, config: Config | None = None, **keys: Any) -> li
     return [r for r in found if isinstance(r, WindowReport)]
 
 
+@pytest.mark.slow
 def test_each_stay_is_one_window_in_the_right_position_a_guard_from_the_turning() -> None:
     order = [0, 1, 2, 3, 0, 2]
     found = windows(turned([FACES[k] for k in order]))
@@ -129,6 +130,7 @@ def test_what_comes_after_a_slip_is_refused_until_the_sensor_is_turned() -> None
     assert found[1].numbers["slipped_mps2"] == pytest.approx(G_MPS2 * slip_rad, abs=0.01)
 
 
+@pytest.mark.slow
 def test_two_stops_near_each_other_are_told_apart_once_the_offset_is_known() -> None:
     lean = G_MPS2 * np.array([np.sin(np.deg2rad(5.0)), 0.0, np.cos(np.deg2rad(5.0))])
     stops = [*FACES, -FACES[0], -FACES[1], lean]
@@ -151,6 +153,7 @@ def test_no_window_reaches_into_a_turning_wherever_it_would_end(window_s: float)
         assert window.stop_s <= stay * (STAY_S + TURN_S) + STAY_S - GUARD_S + 0.25
 
 
+@pytest.mark.slow
 def test_samples_lost_here_and_there_change_no_times() -> None:
     values = turned(FACES[:3])
     lost = [slice(k, k + 3) for k in range(40, len(values) - 3, 30)]  # one in ten

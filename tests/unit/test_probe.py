@@ -95,6 +95,7 @@ def test_a_stranger_and_an_address_of_the_kernel(bus: I2CBus, capsys: pytest.Cap
     assert "WHO_AM_I is 0x00" in found[0x68]["note"]
 
 
+@pytest.mark.slow
 def test_self_test_of_sound_and_stuck_parts(bus: I2CBus, capsys: pytest.CaptureFixture[str]) -> None:
     del bus.targets[0x53]
     found = probed(capsys, "--self-test")
@@ -158,6 +159,7 @@ def on_spi(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0)
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("driver", "kind", "rate_hz", "says"),
     [

@@ -54,6 +54,7 @@ def agent_process(tmp_path: Path, endpoint: str, way: str) -> subprocess.Popen[s
     return process
 
 
+@pytest.mark.slow
 def test_the_interpreter_exits_though_the_publisher_was_never_closed(site: Site, tmp_path: Path) -> None:
     agent = agent_process(tmp_path, site.endpoint, "raise")
     _, faults = agent.communicate("\n", timeout=5)

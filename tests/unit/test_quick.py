@@ -19,4 +19,4 @@ def test_the_cases_of_a_test_count_together_and_a_busy_machine_is_forgiven() -> 
         quick.pytest_runtest_logreport(report(f"a.py::test_a[{case}]", "teardown", MOST_S / 3))
         quick.pytest_runtest_logreport(report(f"a.py::test_a[{case}]", "call", 100.0))
         quick.pytest_runtest_logreport(report("a.py::test_b", "teardown", LIMIT_S / 4))
-    assert quick.slow == ["a.py::test_a took 4.0 s of processor time: mark it `slow`, or make it smaller"]
+    assert quick.slow == ["a.py::test_a took 2.4 s of processor time: mark it `slow`, or make it smaller"]

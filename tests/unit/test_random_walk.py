@@ -8,6 +8,7 @@ the reference is known to 2 %, so that 40 windows show as much.
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
@@ -37,6 +38,7 @@ def walked(seed: int) -> tuple[list[Record], np.ndarray]:
     return records, S
 
 
+@pytest.mark.slow
 def test_s_is_not_moved_by_what_it_has_walked() -> None:
     z = []
     for seed in range(8):

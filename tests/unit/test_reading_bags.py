@@ -129,6 +129,7 @@ SHUFFLED = DRAW.permutation(N)
 SWAPPED = np.arange(N).reshape(-1, 2)[:, ::-1].ravel()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "order", [SHUFFLED, SWAPPED, np.roll(np.arange(N), N // 2)], ids=["shuffled", "swapped", "halves"]
 )
@@ -267,6 +268,7 @@ def db3(directory: Path) -> Path:
     return next((directory / "bag").glob("*.db3"))
 
 
+@pytest.mark.slow
 def test_a_bag_in_sqlite(tmp_path: Path) -> None:
     path = db3(tmp_path)
     assert begins(read_sensor(path)) == N
@@ -307,6 +309,7 @@ HOSTILE_SQL = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", HOSTILE_SQL)
 def test_hostile_databases(kind: str, tmp_path: Path) -> None:
     path, (script, message) = db3(tmp_path), HOSTILE_SQL[kind]
@@ -333,6 +336,7 @@ def ros1(path: Path, compression: str = "", publishers: int = 1) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", ["", "BZ2", "LZ4"])
 def test_a_bag_of_ros_1(compression: str, tmp_path: Path) -> None:
     path = ros1(tmp_path / "a.bag", compression)

@@ -159,6 +159,7 @@ def test_dates_and_gaps_of_pandas(unit: str, tmp_path: Path) -> None:
     same(tmp_path / "a.parquet", 1_700_000_000 + TIME_S, gap)
 
 
+@pytest.mark.slow
 def test_a_bomb_of_parquet_is_refused(tmp_path: Path) -> None:
     pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra files)")
     from pyarrow import parquet

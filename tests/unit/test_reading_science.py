@@ -32,7 +32,7 @@ MATLAB: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("kind", "compressed"), [*((kind, True) for kind in MATLAB), ("a structure", False)])
 def test_matlab(kind: str, compressed: bool, tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", MATLAB[kind], do_compression=compressed)
@@ -54,6 +54,7 @@ def test_a_bomb_beside_the_variables_is_refused(tmp_path: Path, monkeypatch: pyt
     fault(written(tmp_path, data, "b.mat"), "the file says that it holds .* are allowed for its size")
 
 
+@pytest.mark.slow
 def test_a_cell_array_that_announces_too_much_is_refused(tmp_path: Path) -> None:
     cells = np.empty((2, 3), object)
     cells[:] = "a"
@@ -73,7 +74,7 @@ def test_a_file_that_ends_its_reader_is_told(tmp_path: Path) -> None:
     fault(written(tmp_path, bytes(data), "b.mat"), "cannot be read: .*; save it with -v7")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_damaged_matlab(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", MATLAB["vectors"], do_compression=True)
     data = (tmp_path / "a.mat").read_bytes()

@@ -60,7 +60,7 @@ def test_dates_times_of_day_durations_and_missing_cells(tmp_path: Path) -> None:
         read_sensor(path, columns="time=when,x=x,y=y,z=z")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_place_of_a_fault_is_that_of_the_sheet(tmp_path: Path) -> None:
     """Empty rows and comments count, as a person sees them."""
     rows: list[list[Any]] = [["drill 4"], [], HEAD, *ROWS[:5], [], ["# a pause"], *ROWS[5:]]
@@ -74,7 +74,7 @@ def test_the_place_of_a_fault_is_that_of_the_sheet(tmp_path: Path) -> None:
     read_sensor(tmp_path / "b.xlsx", columns="time=time_s,x=vy,y=vy,z=vz")  # the word is in another column
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("cell", [1e20, True, "=2+3", "#DIV/0!", "inf"])
 def test_what_is_no_number(cell: Any, tmp_path: Path) -> None:
     """A formula has no value before a program has computed it; True is no 1."""
@@ -120,7 +120,7 @@ HOSTILE = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_a_hostile_workbook_ends_in_one_line(kind: str, tmp_path: Path) -> None:
     name, edit, told = HOSTILE[kind]

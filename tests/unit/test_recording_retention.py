@@ -237,6 +237,7 @@ def test_a_lack_of_space_must_last_and_then_one_goes_at_a_time(
     assert "if this lasts 300 s, the oldest recordings are deleted, one at a time" in caplog.text
 
 
+@pytest.mark.slow
 def test_young_recordings_go_only_where_the_agent_itself_needs_the_space(
     directory: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -93,6 +93,7 @@ def test_another_reference_drifts_from_its_own_certificate_on() -> None:
     assert found.quantity("reference_drift_y")[1] == pytest.approx(STABILITY * np.sqrt(years), rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("calibrated", "years"), [("", 0.0), ("2022-09-22", 4.0), ("2090-01-01", 0.0)])
 def test_the_agent_counts_from_the_date_in_the_configuration_to_the_utc_of_the_first_window(
     calibrated: str, years: float

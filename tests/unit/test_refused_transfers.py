@@ -93,7 +93,7 @@ def ran(tmp_path: Path, channels: list[str], bug: str, times: int, duration_s: f
     return fieldcal("run", path, "--data-dir", tmp_path / "data", "--duration", str(duration_s))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("plug_in")
 def test_run_ends_with_2_where_no_channel_can_work(tmp_path: Path) -> None:
     done = ran(tmp_path, ["imu"], "the adapter refuses", times=10**9, duration_s=50)

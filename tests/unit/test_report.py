@@ -156,6 +156,7 @@ def test_a_recording_gives_the_same_calibration_and_a_torn_one_what_it_has(
     assert "ends early" in Page(tmp_path / "torn" / "report.html").text
 
 
+@pytest.mark.slow
 def test_a_recording_without_a_calibration_says_why_and_is_status_3(
     recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -212,6 +213,7 @@ def test_a_refused_result_shows_its_reasons(tmp_path: Path, capsys: pytest.Captu
     assert not list((tmp_path / "out" / "figures").iterdir())
 
 
+@pytest.mark.slow
 def test_a_result_of_files_is_shown_with_their_samples_as_long_as_they_are_the_same(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

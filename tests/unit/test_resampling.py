@@ -48,6 +48,7 @@ def test_part_of_a_recording_is_the_same_as_the_whole() -> None:
     np.testing.assert_allclose(part.u, whole.u, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0.0, 0.25, 0.5, None])
 def test_white_noise_has_the_power_that_its_bands_tell(after: float | None) -> None:
     """At the samples of the reference u has all of it, halfway between them 14 % less; `after` None: everywhere between

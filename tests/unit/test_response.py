@@ -61,6 +61,7 @@ def test_s_is_right_at_its_frequency(name: str) -> None:
     assert np.abs(error / u).max() < 4.0
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_late_by_a_sixth_of_a_cycle() -> None:
     """75 ms at 2 Hz: at first hardly a window can be used, so the response is told only when the lag is known."""
     made = pair(0, lowpass(2, 3.0), band_hz=(0.3, 2.0), rate_hz=20.0, seconds=200.0)
@@ -102,6 +103,7 @@ def test_u_covers_with_the_error_of_the_reference() -> None:
     assert inside >= 15  # 99.9 % of binomials of 20 with 0.9545
 
 
+@pytest.mark.slow
 def test_the_response_is_told_as_it_is() -> None:
     response = ALIKE["low-pass, order 2"]
     made = pair(2, response)
@@ -181,6 +183,7 @@ def test_an_unknown_corner_at_a_fifth_of_slow_motion(order: int, side: str) -> N
     assert abs(told / made.sensitivity[0, 0] - true) < 5e-3
 
 
+@pytest.mark.slow
 def test_an_unknown_corner_beside_a_filter_near_the_motion() -> None:
     both = highpass(0.1, 2), lowpass(2, 16.0)
     made = pair(3, lambda f: both[0](f) * both[1](f))
@@ -189,6 +192,7 @@ def test_an_unknown_corner_beside_a_filter_near_the_motion() -> None:
     assert np.abs(error / u).max() < 4.5
 
 
+@pytest.mark.slow
 def test_an_ac_coupled_reference_needs_no_option_but_its_coupling(tmp_path: Path) -> None:
     made = pair(4, highpass(0.1), seconds=120.0)
     sensor, reference = made.files._sensor, made.files._reference
@@ -230,6 +234,7 @@ def test_a_band_that_deviates_is_named() -> None:
     assert "they deviate by 2.4%, limit 1%, and most of it comes from 6.35 Hz" in reason
 
 
+@pytest.mark.slow
 def test_a_small_deviation_is_in_u() -> None:
     made = pair(5, resonance(13.5, 10.0))
     error, u = errors(made, calibrated(made))
@@ -237,6 +242,7 @@ def test_a_small_deviation_is_in_u() -> None:
     assert np.abs(np.diag(error) / np.diag(u)).max() < 2.0
 
 
+@pytest.mark.slow
 def test_noise_of_the_reference_does_not_look_like_a_response() -> None:
     made = pair(6, ALIKE["low-pass, order 2"], reference_noise_mps2=0.03)
     error, u = errors(made, calibrated(made))
@@ -302,6 +308,7 @@ def test_a_channel_with_less_power_than_its_noise_is_silent() -> None:
     assert np.all(np.isfinite(found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4, 8])
 def test_short_stops_beside_an_ac_coupled_reference_settle(seed: int) -> None:
     """Three stops of 4 s, the last one at the end of the recording, with both instruments alike. A filter below the

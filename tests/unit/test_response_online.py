@@ -89,7 +89,7 @@ def test_a_filter_of_the_reference_acts_the_other_way():
     assert deviation_pct(found, np.array(without.sensitivity) / size(name, found)) < SAME_PCT
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", list(FILTERS))
 def test_the_response_is_told_by_frequency(name):
     found = told(name)
@@ -174,6 +174,7 @@ def test_a_restored_state_goes_on_bit_for_bit():
         run.close()
 
 
+@pytest.mark.slow
 def test_a_calibration_with_its_response_is_recorded_exactly():
     update = told("low-pass of order 2, 31 Hz")
     topic = f"/{update.sensor}/{update.what}"

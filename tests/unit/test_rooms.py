@@ -49,6 +49,7 @@ def test_no_text_of_the_library_names_an_option_a_command_or_a_setting_of_the_ag
     assert found == []
 
 
+@pytest.mark.slow
 def test_a_run_loads_neither_virtual_worlds_nor_what_is_done_at_a_desk() -> None:
     """Beside them, `fieldcal run` asks once, before devices open, what stated positions determine (agent.bench)."""
     code = "import sys, agent.cli.run, agent.acquisition.service, agent.recording.device\nprint(*sorted(sys.modules))"
@@ -80,6 +81,7 @@ def test_a_run_loads_nothing_while_devices_are_read() -> None:
     assert run.stdout.splitlines()[-1] == ""
 
 
+@pytest.mark.slow
 def test_calibrate_from_text_loads_no_configuration_and_no_scipy() -> None:
     """To load them takes a quarter of a second."""
     code = "import sys, agent.cli.calibrate\nprint(*sorted({name.partition('.')[0] for name in sys.modules}))"

@@ -157,6 +157,7 @@ def lowpassed(x: np.ndarray) -> np.ndarray:
     return np.asarray(sosfilt(butter(4, [0.2, 20.0], "bandpass", fs=200.0, output="sos"), x))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("station", "message"),
     [

@@ -136,6 +136,7 @@ def run_of(off: Any, on: Any, **more: Any) -> SelfTestRun:
     return SelfTestRun(device="s", t_monotonic_ns=0, t_utc_ns=0, **{**told, **limits, **more})  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_device_tests_itself_at_the_stated_time_and_then_measures_as_before() -> None:
     factor = np.array([1.01, 1.02, 0.97])
     bus = Bus(electrostatic=lambda _: factor)
@@ -158,6 +159,7 @@ def test_a_device_tests_itself_at_the_stated_time_and_then_measures_as_before() 
     assert all(np.abs(block.indications - [0, 0, 256]).max() < 10 for block in blocks)
 
 
+@pytest.mark.slow
 def test_a_range_that_gravity_and_the_self_test_do_not_fit_is_left_for_the_self_test_alone() -> None:
     bus = Bus(Lis3dhTwin, 1000.0)
     sensor = QuickLis3dh("s", Lis3dhOptions(rate_hz=400.0, range_g=2, address=0x19), **bus.timing)
@@ -168,6 +170,7 @@ def test_a_range_that_gravity_and_the_self_test_do_not_fit_is_left_for_the_self_
     assert np.ptp(opened) < 2.0
 
 
+@pytest.mark.slow
 def test_what_moves_too_much_is_told_and_nothing_is_stopped() -> None:
     bus = Bus()
     bus.shaken_g = lambda t: 0.02 * np.sin(2 * np.pi * 3.0 * t)
@@ -193,6 +196,7 @@ def test_it_waits_until_little_moves() -> None:
     assert 50.0 <= (bus.runs[0].t_utc_ns - START_NS) / NS < 61.0
 
 
+@pytest.mark.slow
 def test_a_device_that_goes_away_meanwhile_is_told_and_opened_again() -> None:
     bus = Bus()
     sleep = bus.timing["sleep"]

@@ -118,6 +118,7 @@ def test_a_result_of_another_version_is_one_line_and_status_2(tmp_path: Path) ->
     assert "result 1, a calibration, cannot be read" in said.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.root
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become a user who may not write")
 def test_a_reader_who_may_not_write_sees_a_store_that_was_closed(tmp_path: Path) -> None:

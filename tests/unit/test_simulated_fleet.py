@@ -46,6 +46,7 @@ def consumer_of(site: Site, fleet: SimulatedFleet, directory: Path) -> Iterator[
         yield consumer
 
 
+@pytest.mark.slow
 def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
     site = Site()
     with SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet:
@@ -192,6 +193,7 @@ def test_words_name_an_estimate_by_the_number_that_its_own_gateway_gave_it() -> 
     assert named <= numbers
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_results() -> None:
     def made(seed: int) -> list[list[Result]]:
         story = Story("s0", "drifting", [seed])
@@ -218,7 +220,7 @@ def fleet_command(site: Site, directory: Path, *options: str) -> subprocess.Pope
     return process
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_ctrl_c_ends_the_command_in_order(site: Site, tmp_path: Path) -> None:
     process = fleet_command(site, tmp_path, "--keys", str(tmp_path / "known"))
     process.send_signal(signal.SIGINT)

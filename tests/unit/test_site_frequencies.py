@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -49,12 +51,24 @@ class Frequencies:
         return Hours(hours, day[0], day[1], day[2], day[3], None, peak), own
 
 
+@cache
+def _quiet(seed: int) -> tuple[Frequencies, SiteWatch]:
+    site, watch = Frequencies(seed), SiteWatch(GATEWAY, BANDS_HZ)
+    for _ in range(CHANGED - BEGAN):
+        watch.update(day_of(site.day()[0], BANDS_HZ))
+    return site, watch
+
+
+def fifty_days(seed: int = 1) -> tuple[Frequencies, SiteWatch]:
+    """A site and its watch after 50 days without a change."""
+    return copy.deepcopy(_quiet(seed))
+
+
 def after(days: int, fallen: Array | float = 0.0, shift: Array | float = 0.0, seed: int = 1) -> SiteVerdicts:
     """So many days after a change of this size, which came when 50 days had passed."""
-    site, watch = Frequencies(seed), SiteWatch(GATEWAY, BANDS_HZ)
-    for k in range(50 + days):
-        hours, _ = site.day(*((fallen, shift) if k >= 50 else ()))
-        watch.update(day_of(hours, BANDS_HZ))
+    site, watch = fifty_days(seed)
+    for _ in range(days):
+        watch.update(day_of(site.day(fallen, shift)[0], BANDS_HZ))
     return result(watch)
 
 
@@ -77,6 +91,7 @@ def test_a_frequency_that_falls_at_all_sensors_is_the_structure(band: int) -> No
     assert not found.gateways
 
 
+@pytest.mark.slow
 def test_sound_frequencies_follow_the_temperature_and_are_not_told() -> None:
     assert [len(after(40, seed=seed).frequencies) for seed in range(2)] == [0, 0]
 
@@ -86,6 +101,7 @@ def test_what_one_sensor_sees_alone_is_not_the_structure() -> None:
     assert not after(20, in_window(2, 0.05, slice(0, 2))).frequencies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("see", [2, 3])
 def test_a_frequency_that_fewer_than_three_sensors_see_is_not_told(see: int) -> None:
     site, watch = Frequencies(8), SiteWatch(GATEWAY, BANDS_HZ)
@@ -119,13 +135,13 @@ def test_what_bands_do_since_a_frequency_has_changed_is_told_of_no_sensor() -> N
     assert [one.kind for one in found.sensors] == ["none"] * N
 
 
+@pytest.mark.slow
 def test_a_sensor_that_changes_at_another_time_is_still_named() -> None:
-    site, watch = Frequencies(2), SiteWatch(GATEWAY, BANDS_HZ)
+    site, watch = fifty_days()
     shift = np.zeros((N, len(BANDS_HZ), 3))
-    for k in range(90):
+    for k in range(50, 90):
         shift[2] = -0.03 if k >= 75 else 0.0
-        hours, _ = site.day(in_window(0, 0.02) if k >= 50 else 0.0, shift)
-        watch.update(day_of(hours, BANDS_HZ))
+        watch.update(day_of(site.day(in_window(0, 0.02), shift)[0], BANDS_HZ))
     found = result(watch)
     assert (found.site.kind, found.sensors[2].kind) == ("structure", "sensitivity")
     assert found.least_detectable[0, 0] > after(40).least_detectable[0, 0], "two bands do not count"
@@ -140,6 +156,7 @@ def test_a_visit_does_not_touch_frequencies() -> None:
     assert len(result(watch).frequencies) == 1
 
 
+@pytest.mark.slow
 def test_days_of_results_without_frequencies_are_silent_on_them() -> None:
     site, watch = Frequencies(4), SiteWatch(GATEWAY, BANDS_HZ)
     for k in range(80):
@@ -165,6 +182,7 @@ def test_the_frequency_of_a_day_needs_hours_and_clips_outliers() -> None:
     assert found[2] == pytest.approx(np.repeat(own[2][:, None], 3, axis=1), abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_watch_of_frequencies_goes_on_from_its_snapshot() -> None:
     site, watch = Frequencies(6), SiteWatch(GATEWAY, BANDS_HZ)
     for _ in range(40):

@@ -145,6 +145,7 @@ def test_the_design_of_a_turn_is_the_difference_of_turned_spectra() -> None:
     assert np.array_equal(G[:, :3], np.eye(6)[:, :3])
 
 
+@pytest.mark.slow
 def test_one_sensor_is_named_with_size_and_date(learned: tuple[Site, SiteWatch]) -> None:
     found = after(learned, 12, [4], [0, 0, -0.01, 0, 0, 0])
     assert kinds(found) == {4: "sensitivity"}
@@ -176,6 +177,7 @@ def test_a_gateway_is_told_as_the_gateway(learned: tuple[Site, SiteWatch]) -> No
     assert abs(found.gateways[1].size + 0.01) < found.gateways[1].U
 
 
+@pytest.mark.slow
 def test_of_two_gateways_it_is_not_told_which_and_of_one_nothing_is_seen() -> None:
     for gateway, told in ((GATEWAY // 2, [0]), (0 * GATEWAY, [])):
         site = Site(6, gateway)

@@ -87,9 +87,9 @@ def mean_square(found: list[Adjustment]) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.one_case
-@pytest.mark.parametrize("jitter_s", [100e-6, 20e-6, 0.0])
+@pytest.mark.parametrize("jitter_s", [100e-6, 0.0])
 def test_s_and_q_are_as_uncertain_as_said(jitter_s: float) -> None:
-    highest = chi2_quantile(1.0 - 1e-3 / 12 / 3, DRAWS) / DRAWS  # 99.9 %, Bonferroni over 12 parameters and 3 sizes
+    highest = chi2_quantile(1.0 - 1e-3 / 12 / 2, DRAWS) / DRAWS  # 99.9 %, Bonferroni over 12 parameters and 2 sizes
     assert mean_square(as_they_are(jitter_s)).max() < highest
 
 

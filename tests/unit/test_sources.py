@@ -152,6 +152,7 @@ def resting(record: Record) -> Record:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_rests_alone_and_merged_records_have_budgets_as_well(clamped: list[Record]) -> None:
     records = thinned(many(np.random.default_rng(13), 90, 0.25), 1e4, np.eye(3))
     walks, before = walking(sensitivity=2e-5, offset_mps2=1e-3), Step(-1.0, {"Syy": 0.05})

@@ -64,6 +64,7 @@ def test_noise_and_knocks_are_no_slip() -> None:
         assert window.numbers["step_mps2"] < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [5, 24])
 def test_a_step_of_noise_is_as_large_as_its_uncertainty_says(blocks: int) -> None:
     """2000 windows of white noise, each divided where its step is largest: some 1.5 u, and hardly ever five."""

@@ -98,6 +98,7 @@ def test_a_thin_ellipse_is_a_line_and_what_it_surely_shares() -> None:
     assert np.mean(ahead, axis=0) == pytest.approx(THIN[1], abs=within)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_reference", [0.5, 1.0, 3.0])
 def test_u_of_slopes_has_the_noise_of_channels_that_only_share(of_reference: float) -> None:
     """A tone along x, in 200 windows: what moves along y is known to the reference's noise there, beside that of V.

@@ -22,6 +22,7 @@ from calib.excitation.sustained import sustained_hz
 
 
 # In windows 14 and 18 the sustained motion is so weak that it is calm compared with the shocks.
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 14, 18])
 def test_a_firm_sensor_behind_a_filter_is_taken_beside_traffic(seed: int) -> None:
     (found,) = window(seed)

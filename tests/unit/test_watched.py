@@ -188,6 +188,7 @@ def test_an_hour_tells_mean_noise_power_and_temperature() -> None:
     assert whole[0].band_hz == bands.centre_hz.tolist()
 
 
+@pytest.mark.slow
 def test_missing_clipped_and_stuck_samples_are_counted_and_their_minutes_left_out() -> None:
     world = World(t_s=60.0)
     blocks = []
@@ -219,6 +220,7 @@ def test_an_output_that_is_stuck_is_counted_and_gives_no_numbers() -> None:
     assert hours(results)[0].stuck > 50 * 600
 
 
+@pytest.mark.slow
 def test_silence_ends_an_hour_and_says_nothing_more() -> None:
     world = World(t_s=20.0)
     site, _ = run(watched_config(prior=PRIOR), [world.block() for _ in range(10)])
@@ -300,6 +302,7 @@ def test_a_channel_with_a_reference_or_positions_is_not_watched() -> None:
     assert watched_config().channels[0].watched
 
 
+@pytest.mark.slow
 def test_memory_of_a_channel_at_one_kilohertz_is_bounded() -> None:
     world = World(t_s=0.0, rate_hz=1000.0)
     site, _ = run(watched_config(prior=PRIOR), [world.block(10.0) for _ in range(60)])

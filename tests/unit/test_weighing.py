@@ -82,7 +82,7 @@ def test_a_reference_in_counts_is_told() -> None:
     assert "correct certificate.sensitivity" in line
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_logs_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The virtual bench indicates 26,000 counts per m/s2, and the prior states counts per g."""
     text = "".join(

@@ -50,6 +50,7 @@ def made(count: int) -> list[Window]:
     return windows
 
 
+@pytest.mark.slow
 def test_a_window_keeps_its_sums_and_no_samples() -> None:
     made(1)  # what is cached is there
     before = tracemalloc.get_traced_memory()[0]
