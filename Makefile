@@ -78,10 +78,9 @@ bench: $(VENV)/development  ## figures, each a ratio against a named alternative
 faults: $(VENV)/development  ## breaks the agent on purpose, for an hour; needs root and tools; writes docs/reliability.md
 	$(BIN)/python -m tests.faults
 
-# Most of them wait for an agent, which takes a third of a processor. The slow disk is tested alone, because a busy
-# machine makes a disk look slower than it is. What failed runs once more.
+# The slow disk is tested alone, because a busy machine makes a disk look slower than it is. What failed runs once more.
 faults-short: $(VENV)/development  ## the same in a few minutes; skips what this machine cannot do
-	$(BIN)/python -m pytest -n $(PROCESSES) --dist worksteal -m faults tests/faults -k "not slow" || \
+	$(BIN)/python -m pytest -n auto --dist worksteal -m faults tests/faults -k "not slow" || \
 		$(call once_more,-m faults tests/faults)
 	$(BIN)/python -m pytest -m faults tests/faults -k slow || \
 		$(call once_more,-m faults tests/faults)

@@ -80,6 +80,7 @@ REVISIONS = (
     Revision(19, "a65bd293c7b7", "0.3.0"),
     # The last before a floor of motion, weaker than the sensor's noise, was no noise of the reference any more.
     Revision(20, "00b8cff4d62e", "0.3.0"),
+    Revision(21, "d6ede69441d7", "0.3.0"),
 )
 
 
