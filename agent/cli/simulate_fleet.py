@@ -24,7 +24,6 @@ FILES_PER_GATEWAY = 10  # open files: the store with its readers, and Zenoh; mea
 ROUTER_S = 30.0  # s to wait for a router
 STEP_S = 0.5
 DAY_S = 86400.0
-ENDED = "a process of the fleet ended: there is too little memory for so many gateways"
 NAMES_SHOWN = 5
 
 
@@ -69,14 +68,12 @@ def serve_fleet(options: FleetOptions, seed: int, duration_s: float | None) -> i
 
     Until Ctrl-C, or for `duration_s`. Returns the exit status: 1 without router or with too few files, 2 bad endpoint.
     """
-    from concurrent.futures.process import BrokenProcessPool
-
     from agent.config.key_file import KeyFileError
     from agent.config.known_keys import add_key
     from agent.delivery.router import DEFAULT_ENDPOINT
     from agent.delivery.session import EndpointError
     from agent.fleet.simulated import FleetPlan
-    from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses
+    from agent.fleet.simulated_processes import GATEWAYS_EACH, FleetProcesses, ProcessEnded
 
     fleet, sensors, keys = options.fleet, options.sensors, options.keys
     endpoint, stop = options.connect or DEFAULT_ENDPOINT, StopRequest.by_signals()
@@ -96,13 +93,13 @@ def serve_fleet(options: FleetOptions, seed: int, duration_s: float | None) -> i
                 step = _step_of(simulated, stop, options.truth, seed)
                 try:
                     results = _run(step, stop, options, duration_s)
-                except BrokenProcessPool:  # the end of the fleet, below, sets `stop`
-                    say(f"fieldcal simulate: {ENDED}", err=True)
+                except ProcessEnded as ended:  # the end of the fleet, below, sets `stop`
+                    say(f"fieldcal simulate: {ended}", err=True)
                     return 1
             say(f"{results} results sent")
-    except BrokenProcessPool:
+    except ProcessEnded as ended:
         if not stop.is_set():
-            say(f"fieldcal simulate: {ENDED}", err=True)
+            say(f"fieldcal simulate: {ended}", err=True)
             return 1
     except (EndpointError, KeyFileError, OSError) as error:
         say(f"fieldcal simulate: {error}", err=True)
@@ -122,16 +119,16 @@ def _say_odd(simulated: FleetProcesses) -> None:
 def _step_of(simulated: FleetProcesses, stop: StopEvent, truth: Path | None, seed: int) -> Callable[[int], int]:
     """One round of all gateways, after which `truth` is written; it gives the number of results.
 
-    It raises BrokenProcessPool where a process has ended though it was not to stop.
+    It raises ProcessEnded where a process has ended though it was not to stop.
     """
-    from concurrent.futures.process import BrokenProcessPool
+    from agent.fleet.simulated_processes import ProcessEnded
 
     def step(t_utc_ns: int) -> int:
         try:
             made = simulated.step(t_utc_ns)
             if truth is not None:
                 _write_truth(truth, {"seed": seed, "t_utc_ns": t_utc_ns, "gateways": simulated.truth()})
-        except BrokenProcessPool:
+        except ProcessEnded:
             if not stop.is_set():
                 raise
             return 0  # a process has not ended this round in time

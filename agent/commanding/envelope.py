@@ -46,6 +46,9 @@ class Order(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         )
 
 
+_ORDER = msgspec.json.Decoder(Order)  # made during the import, as agent.delivery.record says
+
+
 @dataclass(frozen=True, slots=True)
 class Envelope:
     """The parts of the bytes of a command. The signature is not verified yet."""
@@ -62,7 +65,7 @@ class Envelope:
             raise Refused("bad signature", f"the signature was not made with key {self.key_id}") from None
         try:
             refuse_doubled_keys(self.body)
-            return msgspec.json.decode(self.body, type=Order)
+            return _ORDER.decode(self.body)
         except (msgspec.DecodeError, ValueError, RecursionError) as error:
             raise Refused("malformed", f"not a command: {error}") from None
 

@@ -111,6 +111,9 @@ class Guide(msgspec.Struct, frozen=True, kw_only=True):
     ending: Ending | None = None
 
 
+_GUIDE = msgspec.json.Decoder(Guide)  # made during the import, as agent.delivery.record says
+
+
 def clipped(text: str, most: int = TEXT_MAX) -> str:
     """A text that a message can hold."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
@@ -133,7 +136,7 @@ def read_guide(payload: bytes, attachment: bytes, gateway: str, keys: WatchedKey
     if keys is not None:
         _verify(payload, attachment, gateway, keys)
     try:
-        return msgspec.json.decode(payload, type=Guide)
+        return _GUIDE.decode(payload)
     except (msgspec.DecodeError, ValueError, RecursionError):
         return None
 

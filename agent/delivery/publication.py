@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import logging
 import threading
+import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ BATCH = 100  # results read from the store at a time
 POLL_S = 0.2  # s after which a router that came back is noticed; asking takes a microsecond
 SETTLE_S = 0.2  # s to wait for a new router to name its subscribers; samples put before reach only the cache
 REOPEN_S = 5.0  # s between two attempts to open a session
+EXPIRY_S = 86_400.0  # s between two looks at the certificates, of which Zenoh reads new files at each new link
 CACHE_SAMPLES = 100  # samples per channel for subscribers that come later; older results are in the store
 HEARTBEAT_S = 10.0  # s between messages that let a subscriber notice a missed last sample; 40 bytes for each subscriber
 RECENT_MAX = 1000  # newest results; those that the store could not write are published from here
@@ -102,6 +104,7 @@ class Publisher:
         self._connected = False
         self._fault = ""
         self._said = ""
+        self._expiry, self._expiry_look_s = "", 0.0  # what is said of certificates; monotonic time of the next look
         self._previous = store.published()
         self._publishers: dict[str, AdvancedPublisher] = {}
         self._told: dict[str, bytes] = {}  # the newest of what the gateway says of itself, by the end of its key
@@ -147,7 +150,7 @@ class Publisher:
     def state(self) -> PublicationState:
         """The present state, for the terminal and the gateway's status."""
         unheard = UNHEARD if self._hearing.doubtful else ""
-        fault = "; ".join(filter(None, (self._fault or unheard, self._other)))
+        fault = "; ".join(filter(None, (self._fault or unheard, self._other, self._expiry)))
         return PublicationState(
             self._key, self._endpoints, self._connected, self._store.published(), fault,
             self._hearing.reopened,
@@ -178,8 +181,6 @@ class Publisher:
 
     def _serve(self) -> None:
         with ExitStack() as open_things:
-            if self._tls and (warning := expiry_warning(self._tls, datetime.now(UTC))):
-                _log.warning("zenoh.tls.%s", warning)
             session = open_things.enter_context(closed_in_time(zenoh.open(self._config)))
             history = open_things.enter_context(self._store.history())
             queryable = session.declare_queryable(f"{self._key}/**", zenoh.handlers.FifoChannel(64), complete=True)
@@ -207,6 +208,7 @@ class Publisher:
             stopping = False
             while not stopping:
                 stopping = self._stop.is_set()  # read first: the last round then sends all that was handed over
+                self._look_at_certificates()
                 if self._find_router(session):
                     self._send_status(session)
                     self._send_waiting(session, history)
@@ -215,6 +217,15 @@ class Publisher:
                     return
                 self._wake.wait(0 if stopping else self._poll_s)
                 self._wake.clear()
+
+    def _look_at_certificates(self) -> None:
+        if self._tls is None or time.monotonic() < self._expiry_look_s:
+            return
+        self._expiry_look_s = time.monotonic() + EXPIRY_S
+        warning = expiry_warning(self._tls, datetime.now(UTC))
+        self._expiry = f"zenoh.tls.{warning}" if warning else ""
+        if warning:
+            _log.warning("%s", self._expiry)
 
     def _note_other_gateway(self, words: str) -> None:
         self._other = words

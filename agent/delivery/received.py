@@ -49,10 +49,13 @@ class _Numbered(msgspec.Struct):
     sequence: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NUMBER)]
 
 
+_NUMBERED = msgspec.json.Decoder(_Numbered)  # made during the import, as agent.delivery.record says
+
+
 def number_of(payload: bytes) -> int:
     """The number that a payload claims, whatever else it says; 0 where it has none."""
     try:
-        return msgspec.json.decode(payload, type=_Numbered).sequence if len(payload) <= LARGEST_RESULT else 0
+        return _NUMBERED.decode(payload).sequence if len(payload) <= LARGEST_RESULT else 0
     except (msgspec.DecodeError, ValueError, RecursionError):
         return 0
 

@@ -14,6 +14,11 @@ from agent.delivery.schema import RESULT_COLUMNS, StoreError, checked, row_crc
 # Reads the rows for `StoredResult.of_joined`; conditions may follow.
 JOINED = f"SELECT {RESULT_COLUMNS}, crc, data, signed_crc FROM results LEFT JOIN signed USING (sequence)"
 
+# msgspec 0.22 resolves the fields of a type when it is first decoded, and shows the type to other threads before that
+# is done: one that decodes it at the same moment ends the process by SIGSEGV. So it is done here, during the import.
+for _kind in RESULTS.values():
+    msgspec.json.Decoder(_kind)
+
 
 @dataclass(frozen=True, slots=True)
 class StoredResult:

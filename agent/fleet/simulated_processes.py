@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from time import monotonic, sleep
 from typing import Any, NamedTuple, TypeVar
 
 from agent.delivery.ending import ProcessEnd, StopRequest
@@ -21,6 +22,7 @@ from agent.fleet.workers import begin
 # Gateways in one process, with two threads each that wake up 15 times a second. docs/fleet-evidence.md: what more cost.
 GATEWAYS_EACH = 100
 LEAVE_S = 3.0  # to end in order, once they are to stop; then what is left is killed: a router sees its gateways leave
+ENDED_S = 1.0  # to learn how a process has ended
 NICE = 10  # gateways are other machines: simulated ones leave the processor to a router and a monitor on this one
 
 SPAWN = multiprocessing.get_context("spawn")  # Zenoh does not work in a forked process
@@ -39,11 +41,15 @@ class NamedGateway(NamedTuple):
     public_key: bytes
 
 
+class ProcessEnded(Exception):  # noqa: N818 - what has happened
+    """A process of the fleet has ended though it was not to. The message says by which signal or status."""
+
+
 class FleetProcesses(AbstractContextManager["FleetProcesses"]):
     """Gateways as planned, in processes of at most GATEWAYS_EACH, which open one by one.
 
     `unconnected`: the number of gateways that found no router. The processes end with this process, and LEAVE_S after
-    they are to stop. Raises EndpointError, StoreError; the methods raise BrokenProcessPool where a process has ended.
+    they are to stop. Raises EndpointError, StoreError, ProcessEnded; the methods raise ProcessEnded.
     """
 
     def __init__(self, plan: FleetPlan, stop: StopRequest | None = None) -> None:
@@ -65,7 +71,9 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
                 numbers = range(part, plan.gateways, parts)
                 with _without_interrupts():
                     opening = process.submit(_open, plan, numbers)
-                gateways, unconnected = opening.result()
+                self._processes = multiprocessing.active_children()
+                with self._telling_ends():
+                    gateways, unconnected = opening.result()
                 opened.callback(_leave, process)
                 self._parts.append(process)
                 self.gateways += gateways
@@ -109,7 +117,28 @@ class FleetProcesses(AbstractContextManager["FleetProcesses"]):
 
     def _in_each_process(self, what: Callable[..., Value], *arguments: Any) -> list[Value]:
         """What the function gives in each process, where they run at the same time."""
-        return [future.result() for future in [part.submit(what, *arguments) for part in self._parts]]
+        with self._telling_ends():
+            return [future.result() for future in [part.submit(what, *arguments) for part in self._parts]]
+
+    @contextmanager
+    def _telling_ends(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenProcessPool:
+            codes: list[int] = []
+            end = monotonic() + ENDED_S
+            while not codes and monotonic() < end:  # the thread of a pool may be about to learn it
+                sleep(0.01)
+                codes = [code for process in self._processes if (code := process.exitcode) is not None]
+            raise ProcessEnded("; ".join(map(_ended_by, codes)) or "a process of the fleet ended") from None
+
+
+def _ended_by(code: int) -> str:
+    if code >= 0:
+        return f"a process of the fleet ended with status {code}"
+    name = signal.Signals(-code).name
+    why = ", as Linux does where there is too little memory" if -code == signal.SIGKILL else ""
+    return f"a process of the fleet was ended by {name}{why}"
 
 
 def _leave(process: ProcessPoolExecutor) -> None:

@@ -74,6 +74,9 @@ class GatewayTold(msgspec.Struct, frozen=True):
     version: str = ""
 
 
+_GATEWAY_TOLD = msgspec.json.Decoder(GatewayTold)  # made during the import, as agent.delivery.record says
+
+
 class Fleet:
     """The newest state of each sensor and gateway. `version` rises with every change. May be used by several threads.
 
@@ -282,7 +285,7 @@ class Fleet:
         if len(status) > LARGEST_TOLD:
             return
         try:
-            told = msgspec.json.decode(status, type=GatewayTold)
+            told = _GATEWAY_TOLD.decode(status)
         except (msgspec.DecodeError, ValueError, RecursionError):
             return
         with self._mutex:

@@ -118,10 +118,13 @@ class _Verdicts(msgspec.Struct):
     sensors: list[_Sensor]
 
 
+_VERDICTS = msgspec.json.Decoder(_Verdicts)  # made during the import, as agent.delivery.record says
+
+
 def suspicions_in(path: Path) -> list[Suspicion]:
     """All suspicions in a file of `fieldcal fleet watch --json`. Raises WatchError with the file and what is wrong."""
     try:
-        told = msgspec.json.decode(read_file(path, LARGEST_FILE), type=_Verdicts)
+        told = _VERDICTS.decode(read_file(path, LARGEST_FILE))
     except OSError as error:
         raise WatchError(f"{path}: {error.strerror or error}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -5,16 +5,22 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
 
 import psutil
 import pytest
 import zenoh
 from zenoh.ext import AdvancedSubscriber, HistoryConfig, declare_advanced_subscriber
 
+from agent.config.tls import TlsFiles
+from agent.delivery import publication
 from agent.delivery.history import StoredResult, StoreError
 from agent.delivery.publication import Publisher
 from agent.delivery.session import EndpointError
 from agent.delivery.store import Store
+from agent.keys.certificates import issue, make_authority
+from agent.keys.files import write_new
 from tests.unit.results import clock
 from tests.unit.zenoh_site import KEY, Site, record, sequence_of, wait_for
 
@@ -293,3 +299,32 @@ def test_an_endpoint_of_an_unknown_protocol_is_a_fault_that_is_told(store: Store
     publisher.start()
     wait_for(lambda: "carrier" in publisher.state().fault)
     publisher.close()
+
+
+def test_a_certificate_that_is_about_to_expire_is_told_while_the_gateway_runs(
+    site: Site, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publication, "EXPIRY_S", 0.0)
+    authority = make_authority("authority", 400, datetime.now(UTC))
+    files = TlsFiles(*(str(tmp_path / name) for name in ("ca.pem", "gateway.pem", "gateway.key")))
+
+    def put(days: int) -> None:
+        made = issue(authority, "gateway", days, datetime.now(UTC))
+        write_new(tmp_path, {"gateway.key": made.key_pem, f"{days}.pem": made.certificate_pem})
+        (tmp_path / f"{days}.pem").replace(files.certificate)
+
+    write_new(tmp_path, {"ca.pem": authority.certificate_pem})
+    put(300)
+    publisher = Publisher("site", "gw", [site.endpoint], store, tls=files)
+    publisher.start()
+    try:
+        wait_for(lambda: publisher.state().connected)
+        assert publisher.state().fault == ""
+        Path(files.key).unlink()
+        put(40)  # as 260 days later
+        wait_for(lambda: "gateway.pem: expires in 39 days, on " in publisher.state().fault)
+        Path(files.key).unlink()
+        put(365)  # renewed
+        wait_for(lambda: publisher.state().fault == "")
+    finally:
+        publisher.close()
