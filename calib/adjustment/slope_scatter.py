@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.distributions import chi2_quantile
-from calib.model import Array
+from calib.model import Array, own_channels
 from calib.windows.condense import Condensed, regressed
 
 PROBABILITY = 0.99  # confidence of the test for scatter: noise alone passes it once in a hundred recordings
@@ -47,17 +47,12 @@ class SlopeScatter:
         """The scatter of condensed windows; `lag_s` and `u_noise` are (B,), or one number for all windows. `shares`
         (B, 2M): noise of the reference over its motion, as power; None where it has none.
 
-        With R'R = P the power of the motion, noise N of which the share d was not subtracted takes P^-1 N b d from the
-        slopes b: most where the motion is weakest.
         """
         m, blocks = data.channels, len(data.slopes)
         own = regressed(data.root, data.slopes)
         noise = np.where(data.telling, data.type_a.noise, np.inf)[:, None]
         lag = -np.einsum("brc,bci->bri", data.root[:, :, m:], own[:, :m]) / noise
-        corrected = np.zeros_like(data.slopes)
-        if shares is not None:
-            power = np.sum(data.root**2, axis=1) * shares
-            corrected = np.linalg.pinv(data.root.mT, rcond=LEAST_ROOT) @ (power[..., None] * own) / noise
+        corrected = np.zeros_like(data.slopes) if shares is None else _corrected(data, own, shares) / noise
         return SlopeScatter(
             np.broadcast_to(np.asarray(lag_s, dtype=float), blocks), lag.reshape(blocks, -1),
             np.broadcast_to(np.asarray(u_noise, dtype=float), blocks), corrected.reshape(blocks, -1),
@@ -94,6 +89,24 @@ class SlopeScatter:
         if self.u_noise.any() and self.corrected.any():
             found["correction for the reference's noise"] = parts[1].T @ parts[1], np.inf
         return found
+
+
+def _corrected(data: Condensed, own: Array, shares: Array) -> Array:
+    """(B, 2M, 3) what noise of the reference, with `shares` (B, 2M) as in SlopeScatter.of, takes from the slopes.
+
+    With R'R = P the power of the motion, noise N takes P^-1 N b from b: most where the motion is weakest. Beside a
+    tri-axial reference b and the shares are those of all windows together: with its own ones, a window would count the
+    more, the less it shows. Of du/dt, b is mostly noise.
+    """
+    m = data.channels
+    u = np.arange(2 * m) < m
+    if own_channels(m) == 3:
+        moved, followed = data.root.mT @ data.root, data.root.mT @ data.slopes
+        own = np.linalg.pinv(moved.sum(axis=0), rcond=LEAST_ROOT**2, hermitian=True) @ followed.sum(axis=0)
+        power = np.diagonal(moved, axis1=1, axis2=2)
+        shares = np.sum(power * shares, axis=0) / np.maximum(power.sum(axis=0), np.finfo(float).tiny)
+    noise = np.sum(data.root**2, axis=1) * np.where(u, shares, 0.0)
+    return np.asarray(np.linalg.pinv(data.root.mT, rcond=LEAST_ROOT) @ (noise[..., None] * own))
 
 
 @lru_cache(maxsize=2)  # each step of a solution asks for it
