@@ -114,7 +114,9 @@ class Excitation:
         if not live.all():
             both = _columns(live, bands.reference_channels)
             bands = replace(bands, products=np.where(np.outer(both, both), bands.products, 0.0))
-        return without_noise(bands, np.sqrt(self.noise))
+        # A noise of which only the most is known must not bend the response.
+        known = self.window.u_noise <= U_NOISE
+        return without_noise(bands, np.sqrt(self.noise) if known else np.zeros_like(self.noise))
 
 
 def excited_together(windows: Sequence[Window]) -> tuple[list[Excitation], Array]:
