@@ -179,7 +179,7 @@ def _signature(name: str, found: Any) -> str:
         text = re.sub(r"<factory>|<object object at 0x[0-9a-f]+>", "...", str(inspect.signature(found)))
     except ValueError:
         return name
-    text = re.sub(r"(?:\w+\.)+(\w+)", r"\1", text).replace("'", "")
+    text = re.sub(r"\b(?:[A-Za-z_]\w*\.)+(\w+)", r"\1", text).replace("'", "")
     if len(name + text) <= WIDTH:
         return name + text
     inside, _, after = text[1:].rpartition(")")
