@@ -120,9 +120,8 @@ def _taken_out_of(output: int, bands: Sequence[BandSums], motion: float) -> Acro
     by_data = by_chance + inverse @ (rest**2 * follows + U_TRANSVERSE**2 * white @ white) @ inverse
     weight = U_TRANSVERSE**2 * np.linalg.inv(by_data + U_TRANSVERSE**2 * np.eye(2))
     c, covariance = weight @ inverse @ shared, U_TRANSVERSE**2 * (np.eye(2) - weight)
-    if (
-        np.abs(c).max() > MOST_TRANSVERSE
-    ):  # no transverse sensitivity: outputs that are copies, or a sensor that is turned
+    # No transverse sensitivity is so large: outputs are copies, or the sensor is turned against what was stated.
+    if np.abs(c).max() > MOST_TRANSVERSE:
         return Across()
     u2 = float(np.sum(covariance * follows) + c @ c * U_TRANSVERSE**2)
     return Across(float(np.sqrt(np.trace(follows))), output, (float(c[0]), float(c[1])), float(np.sqrt(max(u2, 0.0))))

@@ -46,7 +46,6 @@ class SlopeScatter:
     ) -> SlopeScatter:
         """The scatter of condensed windows; `lag_s` and `u_noise` are (B,), or one number for all windows. `shares`
         (B, 2M): noise of the reference over its motion, as power; None where it has none.
-
         """
         m, blocks = data.channels, len(data.slopes)
         own = regressed(data.root, data.slopes)

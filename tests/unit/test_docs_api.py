@@ -51,6 +51,15 @@ def test_every_parameter_is_documented(name: str) -> None:
         assert documented == list(inspect.signature(thing).parameters)
 
 
+def test_the_reference_shows_defaults_as_they_are() -> None:
+    """A name loses the modules before it there, a number nothing."""
+    shown = (ROOT / "docs" / "reference" / "python.md").read_text("utf-8")
+    defaults = {name: p.default for name, p in inspect.signature(calib.calibrate).parameters.items()}
+    numbers = {name: value for name, value in defaults.items() if isinstance(value, float)}
+    assert len(numbers) > 10
+    assert [f"{name}={value!r}" for name, value in numbers.items() if f"{name}={value!r}," not in shown] == []
+
+
 def test_every_name_is_there_and_the_page_has_no_others() -> None:
     assert all(getattr(calib, name) is not None for name in calib.__all__)
     assert set(calib.__all__) <= set(dir(calib))
