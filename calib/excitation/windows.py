@@ -28,6 +28,7 @@ from calib.windows.bands import band_sums
 from calib.windows.sums import pool, window_sums
 
 CALM = "the reference is calm here"  # compared with the rest of the samples
+CLEARLY = 0.8  # least share of the power of that output, that is motion
 FOLLOWS = 0.3  # least share of what the motion moves, as amplitudes, that the output along it has
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
@@ -254,7 +255,7 @@ def _motion(
         clean = _sums(V[kept], u[kept], du[kept], rate_hz, limits)
         if leave_out:
             sums = clean
-    way = _along(pose, V - residual)
+    way = _along(pose, V, residual)
     numbers = motion_numbers(clean, basis[kept], V[kept] @ way, rate_hz, stepped, limits, noise)
     numbers |= nonlinearity(V @ way, residual @ way, rate_hz)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))
@@ -268,13 +269,16 @@ def _motion(
     return replace(window, bands=_bands(points, struck, residual, rate_hz, taper))
 
 
-def _along(pose: Pose, moved: Array) -> Array:
+def _along(pose: Pose, V: Array, residual: Array) -> Array:
     """(3, A) the outputs that a window is judged by: all, or of a uniaxial reference the one along its motion, where
-    that is what the motion has `moved` (n, 3). The others show motion across, which nobody measures."""
+    the motion moves that one, and hardly anything else does. The others show motion across, which nobody measures."""
     if own_channels(pose.direction.shape[1]) != 1:
         return np.eye(3)
     way = pose.direction[:, :1]
-    return way if float(np.var(moved @ way)) > FOLLOWS**2 * float(np.var(moved, axis=0).sum()) else np.eye(3)
+    alone, moved = V @ way, V - residual
+    along = float(np.var(moved @ way))
+    seen = along > FOLLOWS**2 * float(np.var(moved, axis=0).sum()) and along > CLEARLY * float(np.var(alone))
+    return way if seen else np.eye(3)
 
 
 def _bands(

@@ -109,7 +109,7 @@ class Excitation:
     def bands(self) -> BandSums | None:
         """The bands with motion after the correction."""
         bands, live = self.window.bands, self.live
-        if bands is None or own_channels(bands.reference_channels) != len(live):
+        if bands is None or own_channels(bands.reference_channels) != len(live) or not live.any():
             return None
         if not live.all():
             both = _columns(live, bands.reference_channels)
