@@ -136,7 +136,7 @@ def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[di
     assert "learning" in next(line for line in told.output.splitlines() if line.startswith("middle/c"))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_users_meet(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     """From some day on at one sensor: x and y exchanged, twice the sensitivity, dead outputs; wrong units at a gateway;
     lines of another site among the others."""

@@ -164,7 +164,7 @@ def test_a_bridge_beside_a_vertical_reference_is_calm_where_its_motion_across_is
     assert u[8] < 0.003
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_motion_across_that_is_not_stated_is_named_and_not_an_inverted_output() -> None:
     reasons = hours(1.0).gateway.reasons
     assert any("moves across the reference" in reason and "transverse_motion_pct to" in reason for reason in reasons)
