@@ -35,7 +35,8 @@ for kind in sorted(set(kinds(msgspec.Struct)), key=lambda kind: (len(kind.__stru
     if len(ran) > 1:
         print(f"{kind.__module__}.{kind.__name__}")
 """
-ENCODED_ONLY = {"health.GatewayStatus", "health.SensorHealth", "health.Situation", "devices.DeviceHealth"}  # of agent.supervision
+# Those of agent.supervision.
+ENCODED_ONLY = {"health.GatewayStatus", "health.SensorHealth", "health.Situation", "devices.DeviceHealth"}
 BY_ONE_THREAD = {  # that reads a recording; and what an audit tells
     "events.DeviceChange",
     "events.Gap",
