@@ -54,9 +54,8 @@ def between_windows(solution: Solution) -> BetweenWindows:
     offset, freedom = _excess(mean**2, mean_free, noise, unit, OFFSET_PROBABILITY)
     term = np.einsum("win,wim->nm", mean_rows * unit[..., None], mean_rows)
 
-    loading = (
-        s * data.root[:, :m, :m, None] * data.telling / data.type_a.noise[:, None, None]
-    )  # (B, row, channel, axis)
+    # (B, row, channel, axis); 0 for an output that tells nothing of S
+    loading = s * data.root[:, :m, :m, None] * data.telling / data.type_a.noise[:, None, None]
     slope_unit = np.einsum("brca,brca->bra", loading, loading)
     slope_noise = np.broadcast_to(np.diag(data.type_a.slopes).reshape(-1, 3)[:m], slope_unit.shape)
     own, free = slope[:, :m] ** 2, slope_free[:, :m]
