@@ -96,8 +96,8 @@ def meeting(sensor: str, reference: str, stretches: Sequence[Tables], priors: Pr
     used: list[Window] = []
     reasons: list[str] = []
     seen, lag_s = 0, 0.0
-    if any(tables.corner_unknown for tables in stretches):
-        priors = priors.beside_unknown_corner
+    for tables in stretches:
+        priors = tables.beside(priors)
     for tables in stretches:
         outcome = adjusted(tables, priors)
         seen += len(outcome.windows)

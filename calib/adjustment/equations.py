@@ -85,7 +85,7 @@ class Equations:
         self.known = np.array([np.isfinite(p.gravity_mps2).all() for p in held])
         self.output_per_mps2 = priors.output_per_mps2 or self._output_per_mps2()
         self._windows = Windows(
-            self._stack, nominal=self.likely, at_hz=priors.reference_frequency_hz, share=priors.reference_share,
+            self._stack, nominal=self.likely, at_hz=priors.reference_frequency_hz, share=priors.reference_shares,
             known_size=priors.known_size,
         )  # fmt: skip
         self._effect = self.nuisances.effect.copy()

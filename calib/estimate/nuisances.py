@@ -25,7 +25,7 @@ from calib.estimate.quantities import (
 )
 from calib.model import Array, scale_of
 from calib.signal.known_response import UNKNOWN, KnownResponse
-from calib.signal.response import FLAT, NO_MOTION, Response, ResponseModel
+from calib.signal.response import BELOW, FLAT, NO_MOTION, POWERS, Response, ResponseModel
 
 # Standard uncertainty of a term of the response, relative to that of a low-pass filter at the upper end of the motion.
 # It is honest for filters, means and resonances from 1.5 times that frequency on (shown by benchmarks.response).
@@ -81,6 +81,12 @@ class Priors(StatedValues):
         late = {"lag_at_s": self.lag_at_s + known.group_delay_s} if known.is_stated else {}
         return replace(self.with_values(late), known=known)
 
+    @property
+    def reference_shares(self) -> Array:
+        """(9,) the share of the reference in each term of the response, in the order of ALL_POWERS. The rest is the
+        sensor's, and S contains it at the frequency at which S holds."""
+        return np.repeat([self.reference_share, self.reference_share_below], [len(POWERS), len(BELOW)])
+
     def _of_known_filters(self, frequency_hz: float, to_hz: float = 0.0) -> dict[str, float]:
         """What known filters make of S, if it holds at this frequency, from a motion up to `to_hz`.
 
@@ -118,10 +124,10 @@ class Priors(StatedValues):
         scale, u = scale_of(self.parameters), np.sqrt(self.covariance.diagonal()[[0, 4, 8]])
         return scale if np.isfinite(scale) and (u < scale).all() else None
 
-    @property
-    def beside_unknown_corner(self) -> Priors:
-        """These for instruments of which one is AC-coupled, and nobody stated its corner."""
-        return replace(self, corner_unknown=True)
+    def beside_unknown_corner(self, of_reference: float) -> Priors:
+        """These for instruments of which one is AC-coupled, and nobody stated its corner. The part `of_reference` of
+        what it does is the reference's."""
+        return replace(self.with_values({"reference_share_below": of_reference}), corner_unknown=True)
 
     def at_one_frequency(self, motion_hz: float, lag_s: float) -> Priors:
         """These and the prior of the response at `motion_hz`, the only frequency of the motion, where the sensor's

@@ -107,11 +107,11 @@ class Windows:
         held_mps2: Array | None = None,
         *,
         at_hz: float,
-        share: float,
+        share: float | Array,
         known_size: float,
     ) -> None:
         """`zero_degc` is the temperature of S and Q. S holds at the frequency `at_hz`; of ln |h| the part 1 - `share`
-        is the sensor's, which has known filters of size exp(`known_size`) there."""
+        is the sensor's, of each term or (TERMS,), and it has known filters of size exp(`known_size`) there."""
         self.stack, self.channels = stack, stack.along.shape[1]
         self.silent = np.zeros((3, 3)) if nominal is None else nominal @ (np.eye(3) - stack.excited)
         self.away = None if held_mps2 is None else np.nan_to_num(stack.held_mps2 - held_mps2)

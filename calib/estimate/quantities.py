@@ -328,7 +328,8 @@ OF_SENSOR = (
     SENSITIVITY_TEMPERATURE, OFFSET_TEMPERATURE, SENSITIVITY_BEHIND, OFFSET_BEHIND,
 )  # fmt: skip
 FREQUENCIES = (
-    *map(Statement, ("known_size", "known_u", "reference_share")),  # see calib.estimate.nuisances.Priors
+    # See calib.estimate.nuisances.Priors.
+    *map(Statement, ("known_size", "known_u", "reference_share", "reference_share_below")),
     Statement("reference_frequency_hz"),  # at which S holds
 )
 PRIORS = by_name(

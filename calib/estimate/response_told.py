@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.signal.known_response import UNKNOWN, KnownResponse
-from calib.signal.response import NEAR, Complex, Response, by_term
+from calib.signal.response import ALL_POWERS, NEAR, Complex, Response, by_term
 
 if TYPE_CHECKING:
     from calib.estimate.nuisances import Priors
@@ -23,15 +23,15 @@ LEFT_U = 1.0  # standard uncertainties of ln h that may be left in the windows
 
 @dataclass(frozen=True, slots=True)
 class KnownResponses:
-    """The filters that are known, and the sensor's `share` of the response that is left."""
+    """The filters that are known, and the sensor's `shares` (9,) of the response that is left, by term."""
 
     response: KnownResponse = UNKNOWN
-    share: float = 1.0
+    shares: tuple[float, ...] = (1.0,) * len(ALL_POWERS)
 
     @classmethod
     def of(cls, priors: Priors) -> KnownResponses:
         """What the priors state."""
-        return cls(priors.known, 1.0 - priors.reference_share)
+        return cls(priors.known, tuple((1.0 - priors.reference_shares).tolist()))
 
     def size(self, frequency_hz: Array, reference_hz: float) -> Complex | float:
         """h of the sensor's known filters at frequencies, over its size at the reference frequency."""
@@ -103,7 +103,8 @@ def response_of(
     at, u_at = _sensitivities(estimate, covariance, effects, middles_hz, reference_hz, known)
     ends = zip(edges[:-1].tolist(), edges[1:].tolist(), at[1:], u_at[1:], strict=True)
     terms, grid = estimate[9:] @ effects, _spaced(*band_hz, GRID)
-    away = np.abs(known.size(grid, reference_hz) * np.exp(known.share * _log_h(grid, reference_hz, len(terms)) @ terms))
+    left = _log_h(grid, reference_hz, known.shares[: len(terms)]) @ terms
+    away = np.abs(known.size(grid, reference_hz) * np.exp(left))
     limit = coverage_factor * _least_u(estimate[:9], covariance) / 3.0
     return ResponseTold(
         Response(tuple(terms.tolist()), band_hz[1], from_hz),
@@ -164,20 +165,21 @@ def _sensitivities(
 ) -> tuple[Complex, Array]:
     """Complex sensitivities (F, 3, 3) at F frequencies, the lag taken out, and their standard uncertainties."""
     S, z = estimate[:9], estimate[9:]
-    by_unknown = known.share * _log_h(frequency_hz, reference_hz, effects.shape[1]) @ effects.T  # (F, J)
+    by_unknown = _log_h(frequency_hz, reference_hz, known.shares[: effects.shape[1]]) @ effects.T  # (F, J)
     h = (known.size(frequency_hz, reference_hz) * np.exp(by_unknown @ z))[:, None]
     moves = np.concatenate([h[..., None] * np.eye(9), (S * h)[..., None] * by_unknown[:, None, :]], axis=2)
     variance = np.sum((moves @ covariance) * moves.conj(), axis=2).real
     return np.asarray((S * h).reshape(-1, 3, 3)), np.sqrt(np.maximum(variance, 0.0)).reshape(-1, 3, 3)
 
 
-def _log_h(frequency_hz: float | Array, reference_hz: float, powers: int) -> Complex:
-    """Derivatives (..., powers) of ln h at frequencies (...,) by the terms, where |h| is 1 at the reference frequency.
+def _log_h(frequency_hz: float | Array, reference_hz: float, shares: tuple[float, ...]) -> Complex:
+    """Derivatives (..., K) of the sensor's ln h at frequencies (...,) by the terms, where |h| is 1 at the reference
+    frequency. `shares` (K,) of them are the sensor's.
 
     At 0 Hz of an AC-coupled instrument see calib.signal.response.by_term.
     """
-    at = by_term(2.0 * np.pi * np.asarray(frequency_hz, dtype=np.float64), powers)
-    return np.asarray(at - by_term(np.array(2.0 * np.pi * reference_hz), powers).real)
+    at = by_term(2.0 * np.pi * np.asarray(frequency_hz, dtype=np.float64), len(shares))
+    return np.asarray(shares * (at - by_term(np.array(2.0 * np.pi * reference_hz), len(shares)).real))
 
 
 def _around(grid: Array, good: NDArray[np.bool_], reference_hz: float) -> tuple[float, float]:

@@ -361,7 +361,8 @@ class Nuisances:
         # Of ln |h| at the reference frequency by the terms, when the response is 1 at 0 Hz.
         self.reference_frequency_hz, self._known_size = priors.reference_frequency_hz, priors.known_size
         at = np.array([2.0 * np.pi * priors.reference_frequency_hz])
-        self._at_reference = (1.0 - priors.reference_share) * by_term(at, priors.response_model.powers)[0].real
+        powers = priors.response_model.powers
+        self._at_reference = (1.0 - priors.reference_shares[:powers]) * by_term(at, powers)[0].real
         self.applied_response = np.array([t.applied for t in self.terms]) @ self.response
 
     def __len__(self) -> int:

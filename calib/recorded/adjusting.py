@@ -224,7 +224,7 @@ class _Search:
 
     def __init__(self, tables: Tables, priors: Priors, most_between: float) -> None:
         self.most_between, self.narrower = most_between, tuple[Band, ...]()
-        self._tables, self._priors = tables, priors.beside_unknown_corner if tables.corner_unknown else priors
+        self._tables, self._priors = tables, tables.beside(priors)
         self.stated = self._priors
         self.windows: list[Window] = []
         self._latest: tuple[Sequence[Window], Applied, Adjustment] | None = None

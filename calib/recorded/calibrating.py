@@ -78,7 +78,8 @@ def tables_of(
         instrument = replace(instrument, quantity=reference.quantity)
         _check_quantity(reference, options.reference_quantity)
     setting = _setting(options, reference)
-    instrument = replace(instrument, ac_coupled="ac" in (setting.coupling, setting.reference_coupling))
+    coupled = {"ac_coupled": setting.reference_coupling == "ac", "sensor_ac_coupled": setting.coupling == "ac"}
+    instrument = replace(instrument, **coupled)
     if reference is not None and setting.reference_coupling == "dc":
         check_gravity(reference)
     intervals = _intervals(poses, setting, reference)

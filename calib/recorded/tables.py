@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.estimate.nuisances import Priors
 from calib.excitation.front_end import (
     DEFAULT_SETTINGS,
     Aligned,
@@ -79,10 +80,11 @@ class Tables:
         length_s = sum(max(min(p.stop_s, end_s) - max(p.start_s, first_s), 0.0) for p in poses)
         self._joined = segments_joined(length_s, self._making.settings.limits.segment_s)
 
-    @property
-    def corner_unknown(self) -> bool:
-        """Whether an instrument is AC-coupled, and nobody stated its corner."""
-        return self._reference is not None and self._instrument.corner_unknown
+    def beside(self, priors: Priors) -> Priors:
+        """The priors; where an instrument is AC-coupled and nobody stated its corner, with those of what it does."""
+        if self._reference is None or not self._instrument.corner_unknown:
+            return priors
+        return priors.beside_unknown_corner(self._instrument.share_of_corner)
 
     @property
     def rate_hz(self) -> float:

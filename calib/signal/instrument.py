@@ -18,8 +18,8 @@ class Instrument:
     standard deviation of its own noise over its whole band, in that quantity's SI unit; 0 where nobody stated it: it is
     then found from the data. `corner_hz`, `u_corner_hz`: corner frequency of an AC-coupled reference (first order) and
     its standard uncertainty; both 0 where it responds to constants. `sensor_corner_hz`, `u_sensor_corner_hz`: the same
-    of the sensor beside it. `ac_coupled`: the reference or the sensor does not respond to constants. `known`: what is
-    stated of the filters of both.
+    of the sensor beside it. `ac_coupled`, `sensor_ac_coupled`: whether the reference and the sensor do not respond to
+    constants. `known`: what is stated of the filters of both.
     """
 
     quantity: str = "acceleration"
@@ -30,6 +30,7 @@ class Instrument:
     sensor_corner_hz: float = 0.0
     u_sensor_corner_hz: float = 0.0
     ac_coupled: bool = False
+    sensor_ac_coupled: bool = False
     known: KnownResponse = UNKNOWN
 
     @property
@@ -45,4 +46,10 @@ class Instrument:
     @property
     def corner_unknown(self) -> bool:
         """Whether there is a corner that nobody stated: the response below the motion is then an unknown."""
-        return self.ac_coupled and not self.has_corner
+        return (self.ac_coupled or self.sensor_ac_coupled) and not self.has_corner
+
+    @property
+    def share_of_corner(self) -> float:
+        """The reference's share in what an unknown corner does: all where the sensor responds to constants. Where both
+        do not, nothing tells them apart, and all is the sensor's."""
+        return 0.0 if self.sensor_ac_coupled else 1.0
