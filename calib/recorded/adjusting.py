@@ -263,8 +263,19 @@ class _Search:
             self.stated, self._latest = told, None
             self.narrower = narrower_bands(_used(windows), self._priors.reference_frequency_hz)
         if self._latest is None or self._latest[0] is not windows or self._latest[1] != taken:
-            self._latest = windows, taken, adjust(_used(windows), self.stated, taken)
+            self._latest = windows, taken, self._adjusted(windows, taken)
         return self._latest[2]
+
+    def _adjusted(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
+        """The adjustment; where it shows a corner below the motion that is nearer than the priors of its terms allow
+        for, once more with wider ones."""
+        while True:
+            found = adjust(_used(windows), self.stated, taken)
+            terms = () if found.response is None else found.response.terms.terms
+            nearer = self.stated.response_model.nearer(np.array(terms)) if terms else None
+            if nearer is None:
+                return found
+            self.stated = replace(self.stated, response_model=nearer)
 
     def by_band(self, found: Adjustment, lag_s: float) -> ResponseTold | None:
         """The response as each band tells it by itself, where no smooth one is right; `found` is of windows from which

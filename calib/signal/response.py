@@ -21,6 +21,8 @@ POWERS = (2, 3, 4, 5, 6)  # fixed beforehand: if the data chose the number of te
 BELOW = (-1, -2, -3, -4)  # where an instrument is AC-coupled and nobody states its corner
 ALL_POWERS = (*POWERS, *BELOW)
 LOWER = 5.0  # times the corner of an AC-coupled instrument: the motion's lower end from which on the terms explain it
+NEARER = 4.0  # times the corner: from there on the priors allow for the fourth term of a filter of first order
+ALLOWED = 1.2  # times the corner that the data have shown: a larger one is looked at again
 BELOW_UNIT = 0.2  # unit of a term below, in that of a filter of first order: its prior covers filters of order 4
 EDGE = 2.0  # cycles at the lower end of the motion, over which the terms below act
 UNSEEN = 0.45  # times the lower end of the motion: where the terms below begin to act; they do in full at twice that
@@ -71,7 +73,7 @@ class Response:
     @property
     def rounded(self) -> Response:
         """The same to 0.1 %: a filter for it serves many windows."""
-        unit = in_units(self.to_hz, self.from_hz)[: len(self.terms)]
+        unit = in_units(self.to_hz, self.from_hz / LOWER)[: len(self.terms)]
         return replace(self, terms=tuple((np.round(np.array(self.terms) / unit * ROUNDED) / ROUNDED * unit).tolist()))
 
     @property
@@ -95,11 +97,11 @@ FLAT = Response()
 
 
 @lru_cache(maxsize=16)
-def in_units(to_hz: float, from_hz: float = 0.0) -> Array:
+def in_units(to_hz: float, corner_hz: float = 0.0) -> Array:
     """The terms that a low-pass filter of first order at `to_hz` has, without their signs: (5,), or (9,) with those of
-    an AC-coupled instrument beside a motion from `from_hz` on. Read-only."""
+    an AC-coupled instrument with the corner `corner_hz`, times BELOW_UNIT. Read-only."""
     above = [1.0 / (k * (2.0 * np.pi * to_hz) ** k) for k in POWERS]
-    below = [BELOW_UNIT / -k * (2.0 * np.pi * from_hz / LOWER) ** -k for k in BELOW] if from_hz else []
+    below = [BELOW_UNIT / -k * (2.0 * np.pi * corner_hz) ** -k for k in BELOW] if corner_hz else []
     units = np.array([*above, *below])
     units.flags.writeable = False
     return units
@@ -113,11 +115,13 @@ def attenuating(frequency_hz: float) -> Array:
 @dataclass(frozen=True, slots=True)
 class ResponseModel:
     """Which terms of a response are unknowns: those of a motion up to `to_hz`, and those below it, where `from_hz` says
-    where it begins. `one_frequency`: the motion has only that of `to_hz`, which tells |h| alone."""
+    where it begins. `one_frequency`: the motion has only that of `to_hz`, which tells |h| alone. `seen_corner_hz`: the
+    corner below the motion that the data have shown, where it is nearer than a NEARER-th of `from_hz`."""
 
     to_hz: float = 0.0
     from_hz: float = 0.0
     one_frequency: bool = False
+    seen_corner_hz: float = 0.0
 
     @property
     def powers(self) -> int:
@@ -125,11 +129,25 @@ class ResponseModel:
         return len(ALL_POWERS if self.from_hz else POWERS)
 
     @property
+    def corner_hz(self) -> float:
+        """The corner whose terms are the scale of the priors of those below the motion."""
+        return max(self.from_hz / LOWER, self.seen_corner_hz)
+
+    def nearer(self, terms: Array) -> ResponseModel | None:
+        """The same for an instrument whose corner is nearer to the motion than the priors allow for, as the terms (K,)
+        that were found show; None where they allow for it."""
+        if not self.from_hz:
+            return None
+        seen_hz = abs(float(terms[ALL_POWERS.index(-1)])) / (2.0 * np.pi)
+        allowed_hz = max(self.from_hz / NEARER, ALLOWED * self.seen_corner_hz)
+        return replace(self, seen_corner_hz=seen_hz) if seen_hz > allowed_hz else None
+
+    @property
     def unknowns(self) -> dict[str, Array]:
         """By name, the terms (5,) or (9,) of one unit of each unknown."""
         if self.one_frequency:
             return {"attenuation": attenuating(self.to_hz)}  # -ln |h| there
-        units = np.diag(in_units(self.to_hz, self.from_hz))
+        units = np.diag(in_units(self.to_hz, self.corner_hz))
         return {f"response_{power}": unit for power, unit in zip(ALL_POWERS, units, strict=False)}
 
 
