@@ -26,6 +26,10 @@ from calib.recorded.tables import Making, Tables
 from calib.recorded.wrong_unit import check_gravity, gravity_warnings
 from calib.signal.instrument import Instrument
 
+CORNERS_ALIKE = (
+    "sensor and reference are both AC-coupled and no corner is stated: nothing tells what is the reference's, so S "
+    "contains what the reference's corner does; state `reference_corner_hz`, or `reference_coupling` dc"
+)
 COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands of points
 
 
@@ -42,6 +46,8 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
         found = causes(sensor, reference, poses, outcome)
         return replace(outcome, calibration=None, reasons=(*found, *silent, *outcome.reasons))
     told = [*outcome.warnings, *axis_warnings(outcome.sensitivity), *silent]
+    if reference is not None and options.method == 3 and _coupled(options, reference).corners_alike:
+        told.append(CORNERS_ALIKE)
     if reference is not None and _setting(options, reference).reference_coupling == "dc":
         told += gravity_warnings(reference)
     return replace(outcome, warnings=tuple(told))
@@ -78,8 +84,7 @@ def tables_of(
         instrument = replace(instrument, quantity=reference.quantity)
         _check_quantity(reference, options.reference_quantity)
     setting = _setting(options, reference)
-    coupled = {"ac_coupled": setting.reference_coupling == "ac", "sensor_ac_coupled": setting.coupling == "ac"}
-    instrument = replace(instrument, **coupled)
+    instrument = _coupled(options, reference, instrument)
     if reference is not None and setting.reference_coupling == "dc":
         check_gravity(reference)
     intervals = _intervals(poses, setting, reference)
@@ -87,6 +92,13 @@ def tables_of(
     more = not options.plain
     settings = Settings(limits, leave_out=more, limit_band=more, bands=more)
     return Tables(sensor, reference, intervals, instrument, Making(settings, align=more))
+
+
+def _coupled(options: Options, reference: ReferenceTable | None, instrument: Instrument | None = None) -> Instrument:
+    """The instrument, by default that of the options, with the couplings of reference and sensor."""
+    setting = _setting(options, reference)
+    coupled = {"ac_coupled": setting.reference_coupling == "ac", "sensor_ac_coupled": setting.coupling == "ac"}
+    return replace(instrument or instrument_of(options), **coupled)
 
 
 def _check_quantity(reference: ReferenceTable, stated: str | None) -> None:

@@ -49,6 +49,11 @@ class Instrument:
         return (self.ac_coupled or self.sensor_ac_coupled) and not self.has_corner
 
     @property
+    def corners_alike(self) -> bool:
+        """Whether neither responds to constants, and nobody stated a corner: nothing tells both apart."""
+        return self.corner_unknown and self.ac_coupled and self.sensor_ac_coupled
+
+    @property
     def share_of_corner(self) -> float:
         """The reference's share in what an unknown corner does: all where the sensor responds to constants. Where both
         do not, nothing tells them apart, and all is the sensor's."""
