@@ -12,7 +12,10 @@ from calib.signal.instrument import Instrument
 from calib.signal.resampling import BAND, DIFFERENTIATED_BAND_HZ, differentiated_band_hz
 
 NOISE_MATTERS = 1.4e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
-FILTER_BAND = 1.197  # times its band: the noise-equivalent bandwidth of calib.signal.band.lowpass
+# Times its band: the bandwidth of calib.signal.band.lowpass that is equivalent for white noise, and for white noise that
+# was differentiated once, twice and three times, most of which is in the filter's edge.
+FILTER_BANDS = (1.197, 1.201, 1.206, 1.213)
+FILTER_BAND = FILTER_BANDS[0]
 # 1 % of gravity. A reference that moves by more beside a sensor does not rest.
 LEAST_MOTION_MPS2 = 0.1
 TOO_FAST = 0.01  # of the power of the reference: what interpolation loses of so little does not show
@@ -62,7 +65,7 @@ def band_to_keep(
     band_hz = min((end_hz for end_hz in ends_hz if end_hz is not None), default=None)
     if band_hz is None:
         return None, unlimited.reshape(2, m), u_noise
-    noise_hz = np.minimum(FILTER_BAND * band_hz, widest_hz)
+    noise_hz = np.minimum(np.array(FILTER_BANDS[derivatives : derivatives + 2]) * band_hz, widest_hz)
     noise = noise_in_bands(instrument.known.noise(float(noise_hz[0]), rate_hz) * density, noise_hz, derivatives)
     return band_hz, noise, u_noise
 
