@@ -12,8 +12,8 @@ from calib.signal.instrument import Instrument
 from calib.signal.resampling import BAND, DIFFERENTIATED_BAND_HZ, differentiated_band_hz
 
 NOISE_MATTERS = 1.4e-5  # of the motion's power: a filter against less of it would cost its ends for nothing
-# Times its band: the bandwidth of calib.signal.band.lowpass that is equivalent for white noise, and for white noise that
-# was differentiated once, twice and three times, most of which is in the filter's edge.
+# Times its band: the equivalent bandwidth of calib.signal.band.lowpass for white noise, and for white noise that was
+# differentiated once, twice and three times, most of which is in the filter's edge.
 FILTER_BANDS = (1.197, 1.201, 1.206, 1.213)
 FILTER_BAND = FILTER_BANDS[0]
 # 1 % of gravity. A reference that moves by more beside a sensor does not rest.

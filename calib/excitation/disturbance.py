@@ -103,19 +103,23 @@ def against_noise(points: Points, reference_noise: Array, *, knocked: bool) -> N
     return _filter(weights, edges, size, rate_hz, lowest_hz, len(u), reference_noise)
 
 
-def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float) -> Array:
+def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float, derivatives: int = 0) -> Array:
     """The reference's noise (2, m) in u and du/dt, no larger than what of u the sensor does not show.
 
     Noise that is thought to be white may be coloured, or a motion that fills the spectrum. Where both contradict each
-    other clearly at the frequencies of the motion, half of what is incoherent there counts as white noise.
+    other clearly at the frequencies of the motion, half of what is incoherent there counts as white noise. Of a
+    quantity that was differentiated so often the noise is white; in u it grows with the frequency.
     """
     power = noise[0] ** 2
     if not len(u) or np.all(power <= MATTERS * np.var(u, axis=0)) or (told := incoherent_by_band(u, V)) is None:
         return noise
     alone, moved = told[0], np.maximum(told[1] - told[0], 0.0)
-    end_hz = np.sqrt(3.0) * np.divide(noise[1], noise[0], out=np.zeros_like(power), where=power > 0.0) / (2.0 * np.pi)
+    rate = np.divide(noise[1], noise[0], out=np.zeros_like(power), where=power > 0.0)
+    end_hz = np.sqrt((2 * derivatives + 3) / (2 * derivatives + 1)) * rate / (2.0 * np.pi)
     bands = np.clip(2.0 * end_hz / rate_hz, 1.0 / len(alone), 1.0) * len(alone)  # that have this noise
-    most = np.sum(moved * alone, axis=0) / np.maximum(moved.sum(axis=0), TINY) * bands
+    at = np.minimum((np.arange(len(alone))[:, None] + 0.5) / bands, 1.0)
+    white = (2 * derivatives + 1) * at ** (2 * derivatives) / bands  # of the noise, the part in each band
+    most = np.sum(moved * alone, axis=0) / np.maximum(np.sum(moved * white, axis=0), TINY)
     size = np.sqrt(np.divide(0.5 * most, power, out=np.ones_like(power), where=power > CLEARLY * most))
     return np.asarray(noise * size)
 

@@ -218,7 +218,7 @@ def aligned(
     if u_noise > U_NOISE and not settings.limit_band:  # Method 3 as printed
         noise = np.zeros_like(noise)
     noise = noise if against is None else against.reference_noise
-    noise = not_more_than_incoherent(noise, points.u[:, :m], points.V, sensor_rate_hz)
+    noise = not_more_than_incoherent(noise, points.u[:, :m], points.V, sensor_rate_hz, instrument.derivatives)
     told = {name: float(count) for name, count in counts.items() if count}
     sensor_noise = np.sqrt(0.5 * sensor_rate_hz) * band_above_noise(V, sensor_rate_hz)[1]
     return Aligned(
