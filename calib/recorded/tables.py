@@ -24,6 +24,7 @@ from calib.excitation.pieces import pieces_of
 from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
 from calib.recorded.alignment import drift
+from calib.recorded.clock_offset import clock_offset
 from calib.recorded.errors import InputError
 from calib.recorded.poses import PoseInterval
 from calib.recorded.segments import segments_joined, with_joined
@@ -134,6 +135,28 @@ class Tables:
         if rate:
             self._stretch(rate, at_s)
         return lag_s
+
+    @property
+    def offset_s(self) -> float:
+        """By how much the reference's times were moved, because the sensor's clock shows so much more; 0 if not."""
+        return 0.0 if self._reference is None else self._reference.moved_s
+
+    def join_clocks(self, near_s: float) -> bool:
+        """Move the reference's times by the offset of the two clocks, where it is more than `near_s` and was not moved
+        before; whether it was. Offsets of parts of the recording that differ by `near_s` at most agree."""
+        if self._reference is None or not self._making.align or self.offset_s:
+            return False
+        before, (first_s, end_s) = (self._reference.clock, self.rate), self._sensor.span_s
+        self._reference.move(0.0)
+        found = clock_offset(self._stretches(), end_s - first_s, MOST_RATE, near_s)
+        if found is None or abs(found[0]) <= near_s:
+            self._reference.clock, self.rate = before
+            return False
+        offset_s, self.rate, at_s = found
+        self._reference.move(offset_s)
+        self._reference.stretch(self.rate, at_s)
+        self._phase_rad = np.inf
+        return True
 
     def _stretch(self, rate: float, at_s: float) -> None:
         assert self._reference is not None

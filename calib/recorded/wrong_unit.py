@@ -7,8 +7,10 @@ import math
 import numpy as np
 
 from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.model import Array
 from calib.recorded.errors import UnitError
 from calib.recorded.table import ReferenceTable
+from calib.signal.order_statistics import median
 
 # How large gravity is in units that are taken for m/s2.
 GRAVITY_IN = {"g": 1.0, "mg": 1000.0, "cm/s2": 100 * STANDARD_GRAVITY_MPS2, "mm/s2": 1000 * STANDARD_GRAVITY_MPS2}
@@ -61,20 +63,46 @@ def gravity_warnings(reference: ReferenceTable) -> list[str]:
     ]
 
 
+def feels_gravity(reference: ReferenceTable) -> bool:
+    """Whether a reference measures gravity, and so is DC-coupled: a tri-axial one of accelerations, but for one whose
+    mean is small, of all samples and of some. One that seems to be in another unit counts as one that does."""
+    if reference.channels != 3 or reference.quantity != "acceleration":
+        return False
+    if not reference.unit_stated and not _mean_length(reference)[1]:
+        return True
+    rows = _some_rows(reference)
+    return float(np.linalg.norm(rows.mean(axis=0))) >= NOT_FELT_MPS2 or _middle_length(rows) >= NOT_FELT_MPS2
+
+
+def _middle_length(rows: Array) -> float:
+    """The median magnitude of the means over so many samples that fast motion is no longer in them."""
+    size = max(size for size in MEANS_OF[:-1] if FEWEST * size <= len(rows) or size == 1)
+    return float(median(np.linalg.norm(_means(rows, size), axis=1)))
+
+
+def _some_rows(reference: ReferenceTable) -> Array:
+    """Whole rows (n, C) of the reference, spread over its samples."""
+    x, step = reference.x, -(-len(reference.x) // ROWS)
+    some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
+    rows = np.concatenate(some)
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+
+def _means(rows: Array, size: int) -> Array:
+    """The means of so many consecutive rows each."""
+    return np.asarray(rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1))
+
+
 def _mean_length(reference: ReferenceTable) -> tuple[float, bool]:
     """The magnitude of the mean where it is steadiest, and whether it is a usual one over any number of samples.
 
     Means over more and more samples are tried: those of a few contain the motion, those of many how the reference was
     turned.
     """
-    x, step = reference.x, -(-len(reference.x) // ROWS)
-    some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
-    rows = np.concatenate(some)
-    rows = rows[np.isfinite(rows).all(axis=1)]
+    rows = _some_rows(reference)
     lengths, scatter = [], []
     for size in (size for size in MEANS_OF if FEWEST * size <= len(rows) or size == 1):
-        means = rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1)
-        low, middle, high = np.quantile(np.linalg.norm(means, axis=1), (0.25, 0.5, 0.75)).tolist()
+        low, middle, high = np.quantile(np.linalg.norm(_means(rows, size), axis=1), (0.25, 0.5, 0.75)).tolist()
         lengths.append(middle)
         scatter.append((high - low) / max(middle, np.finfo(float).tiny))
     named = [k for k, length in enumerate(lengths) if _unit(length) and scatter[k] < STEADY]
