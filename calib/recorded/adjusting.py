@@ -86,9 +86,10 @@ def adjusted(
         told = _adjusted(tables, priors)
     outcome, found = _at_rest(told, priors)
     outcome = _with_remedy(outcome, tables, priors)
-    outcome = replace(outcome, more={**outcome.more, "band_hz": band_hz, "clock_offset_s": tables.offset_s})
-    if tables.offset_s:
-        outcome = replace(outcome, warnings=(_offset_warning(tables.offset_s),))
+    offset_s = 0.0 if _is_lost(outcome.windows) else tables.offset_s
+    outcome = replace(outcome, more={**outcome.more, "band_hz": band_hz, "clock_offset_s": offset_s})
+    if offset_s:
+        outcome = replace(outcome, warnings=(_offset_warning(offset_s),))
     if found is not None and found.across.motion:
         outcome = replace(outcome, warnings=(*outcome.warnings, _across_warning(found.across, priors.transverse)))
     if found is None or (share := found.share) is None:
@@ -254,7 +255,7 @@ class _Search:
             elsewhere = abs(lag_s - applied.lag_s) * largest_omega(self.windows) > EIGHTH_RAD
             if lost or elsewhere or self._tables.rate != rate:
                 applied = self.make(replace(flat, lag_s=lag_s))
-        if (not _used(self.windows) or _hardly_used(self.windows)) and self._join_clocks():
+        if _is_lost(self.windows) and self._join_clocks():
             return self.begin()
         if _used(self.windows):
             return applied
@@ -315,6 +316,11 @@ def _next_response(found: Response, taken: Response = FLAT) -> Response:
     """What to take out after a turn that found this response. Terms below the motion that were taken out stay: without
     their filter the windows would be longer ones again, and the search could go to and fro between both."""
     return (found if taken.from_hz else found.without_slight_below).modest
+
+
+def _is_lost(windows: Sequence[Window]) -> bool:
+    """Whether no window can be used, or almost none of the motion."""
+    return not _used(windows) or bool(_hardly_used(windows))
 
 
 def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:

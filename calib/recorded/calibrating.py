@@ -23,7 +23,7 @@ from calib.recorded.poses import PoseInterval, Poses, PoseSettings, beside_refer
 from calib.recorded.priors import contradictions, instrument_of, priors_of
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.recorded.tables import Making, Tables
-from calib.recorded.wrong_unit import check_gravity, feels_gravity, gravity_warnings
+from calib.recorded.wrong_unit import check_gravity, gravity_warnings, measures_gravity, unconfirmed_unit
 from calib.signal.instrument import Instrument
 
 COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands of points
@@ -44,6 +44,8 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
     told = [*outcome.warnings, *axis_warnings(outcome.sensitivity), *silent]
     if reference is not None and _setting(options, reference).reference_coupling == "dc":
         told += gravity_warnings(reference)
+    elif reference is not None and options.reference_coupling is None:
+        told += unconfirmed_unit(reference)
     return replace(outcome, warnings=tuple(told))
 
 
@@ -110,7 +112,7 @@ def _setting(options: Options, reference: ReferenceTable | None) -> PoseSettings
 
 
 def _usual_coupling(reference: ReferenceTable | None) -> Coupling:
-    return "dc" if reference is not None and feels_gravity(reference) else "ac"
+    return "dc" if reference is not None and measures_gravity(reference) else "ac"
 
 
 def _intervals(poses: Poses | None, setting: PoseSettings, reference: ReferenceTable | None) -> list[PoseInterval]:

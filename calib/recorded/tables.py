@@ -29,7 +29,7 @@ from calib.recorded.errors import InputError
 from calib.recorded.poses import PoseInterval
 from calib.recorded.segments import segments_joined, with_joined
 from calib.recorded.streams import TableStream
-from calib.recorded.table import ReferenceTable, SensorTable, ends_s
+from calib.recorded.table import FIRST_DATE_S, ReferenceTable, SensorTable, ends_s, moment
 from calib.signal.band import HALVED, STOP_BAND
 from calib.signal.instrument import Instrument
 from calib.signal.response import FLAT, Response
@@ -323,8 +323,13 @@ def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses:
     if poses:
         spans.append(("the poses", min(p.start_s for p in poses), max(p.stop_s for p in poses)))
     if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):
-        told = ", ".join(f"{name} from {start:.10g} s to {stop:.10g} s" for name, start, stop in spans)
-        raise InputError("they do not overlap in time", f"their times must be on one scale: {told}")
+        told = ", ".join(f"{name} from {moment(start)} to {moment(stop)}" for name, start, stop in spans)
+        raise InputError("they do not overlap in time", f"their times must be on one scale: {told}{_zone(spans)}")
+
+
+def _zone(spans: Sequence[tuple[str, float, float]]) -> str:
+    """A hint where all times are dates; they may be those of different zones."""
+    return "; a date without a zone is taken as UTC" if min(start for _, start, _ in spans) > FIRST_DATE_S else ""
 
 
 def _interpolated(at_s: Array, time_s: Array, values: Array) -> Array:

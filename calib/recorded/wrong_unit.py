@@ -10,7 +10,6 @@ from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import Array
 from calib.recorded.errors import UnitError
 from calib.recorded.table import ReferenceTable
-from calib.signal.order_statistics import median
 
 # How large gravity is in units that are taken for m/s2.
 GRAVITY_IN = {"g": 1.0, "mg": 1000.0, "cm/s2": 100 * STANDARD_GRAVITY_MPS2, "mm/s2": 1000 * STANDARD_GRAVITY_MPS2}
@@ -63,21 +62,28 @@ def gravity_warnings(reference: ReferenceTable) -> list[str]:
     ]
 
 
-def feels_gravity(reference: ReferenceTable) -> bool:
-    """Whether a reference measures gravity, and so is DC-coupled: a tri-axial one of accelerations, but for one whose
-    mean is small, of all samples and of some. One that seems to be in another unit counts as one that does."""
+def unconfirmed_unit(reference: ReferenceTable) -> list[str]:
+    """A sentence where neither gravity nor anybody tells the unit of a tri-axial reference of accelerations."""
+    if reference.channels != 3 or reference.quantity != "acceleration" or reference.unit_stated:
+        return []
+    return [
+        "the reference feels no gravity, and nobody stated its unit: it is taken as AC-coupled, and in m/s2; state the "
+        "unit after the names of its columns"
+    ]
+
+
+def measures_gravity(reference: ReferenceTable) -> bool:
+    """Whether a reference measures gravity, and so is DC-coupled: a tri-axial one of accelerations, unless its mean is
+    small and no means over some samples have a steady magnitude. One that seems to be in another unit counts as one
+    that does."""
     if reference.channels != 3 or reference.quantity != "acceleration":
         return False
     if not reference.unit_stated and not _mean_length(reference)[1]:
         return True
     rows = _some_rows(reference)
-    return float(np.linalg.norm(rows.mean(axis=0))) >= NOT_FELT_MPS2 or _middle_length(rows) >= NOT_FELT_MPS2
-
-
-def _middle_length(rows: Array) -> float:
-    """The median magnitude of the means over so many samples that fast motion is no longer in them."""
-    size = max(size for size in MEANS_OF[:-1] if FEWEST * size <= len(rows) or size == 1)
-    return float(median(np.linalg.norm(_means(rows, size), axis=1)))
+    if float(np.linalg.norm(rows.mean(axis=0))) >= NOT_FELT_MPS2:
+        return True
+    return any(length >= NOT_FELT_MPS2 and scatter < STEADY for length, scatter in _mean_lengths(rows))
 
 
 def _some_rows(reference: ReferenceTable) -> Array:
@@ -88,9 +94,14 @@ def _some_rows(reference: ReferenceTable) -> Array:
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
-def _means(rows: Array, size: int) -> Array:
-    """The means of so many consecutive rows each."""
-    return np.asarray(rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1))
+def _mean_lengths(rows: Array) -> list[tuple[float, float]]:
+    """The median magnitude of means over more and more samples, and the distance of its quartiles over it."""
+    told = []
+    for size in (size for size in MEANS_OF if FEWEST * size <= len(rows) or size == 1):
+        means = rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1)
+        low, middle, high = np.quantile(np.linalg.norm(means, axis=1), (0.25, 0.5, 0.75)).tolist()
+        told.append((middle, (high - low) / max(middle, np.finfo(float).tiny)))
+    return told
 
 
 def _mean_length(reference: ReferenceTable) -> tuple[float, bool]:
@@ -100,11 +111,7 @@ def _mean_length(reference: ReferenceTable) -> tuple[float, bool]:
     turned.
     """
     rows = _some_rows(reference)
-    lengths, scatter = [], []
-    for size in (size for size in MEANS_OF if FEWEST * size <= len(rows) or size == 1):
-        low, middle, high = np.quantile(np.linalg.norm(_means(rows, size), axis=1), (0.25, 0.5, 0.75)).tolist()
-        lengths.append(middle)
-        scatter.append((high - low) / max(middle, np.finfo(float).tiny))
+    lengths, scatter = zip(*_mean_lengths(rows), strict=True)
     named = [k for k, length in enumerate(lengths) if _unit(length) and scatter[k] < STEADY]
     best = min(named or range(len(lengths)), key=lambda k: scatter[k])
     not_felt = float(np.linalg.norm(rows.mean(axis=0))) < NOT_FELT_MPS2

@@ -15,7 +15,7 @@ from calib.recorded.measurement_result import NuisanceValue
 from calib.recorded.notebook import calibrate
 from calib.recorded.outcome import Outcome
 from calib.recorded.table import ReferenceTable
-from calib.recorded.wrong_unit import check_gravity, feels_gravity, gravity_warnings
+from calib.recorded.wrong_unit import check_gravity, gravity_warnings, measures_gravity
 from tests.clamp_windows import frame
 
 Table = tuple[np.ndarray, np.ndarray]  # times in s and values
@@ -189,12 +189,12 @@ def test_which_references_feel_gravity() -> None:
         "one axis": (turned[:, :1], False),
     }
     for told, (x, expected) in feels.items():
-        assert feels_gravity(ReferenceTable("reference", t, x, "acceleration", "ax")) is expected, told
-    assert not feels_gravity(ReferenceTable("reference", t, turned, "velocity", "vx"))
+        assert measures_gravity(ReferenceTable("reference", t, x, "acceleration", "ax")) is expected, told
+    assert not measures_gravity(ReferenceTable("reference", t, turned, "velocity", "vx"))
     # 1 in the unit g, which nobody stated, is refused as such (check_gravity); stated m/s2 is an offset of 0.09 g.
     in_g = np.tile([0.0, 0.0, 0.9], (1000, 1))
-    assert feels_gravity(ReferenceTable("reference", t[:1000], in_g, "acceleration", "ax"))
-    assert not feels_gravity(ReferenceTable("reference", t[:1000], in_g, "acceleration", "ax", unit_stated=True))
+    assert measures_gravity(ReferenceTable("reference", t[:1000], in_g, "acceleration", "ax"))
+    assert not measures_gravity(ReferenceTable("reference", t[:1000], in_g, "acceleration", "ax", unit_stated=True))
 
 
 def test_a_stated_unit_is_believed_and_the_size_told() -> None:
