@@ -180,6 +180,12 @@ def test_a_unit_that_neither_gravity_nor_anybody_tells_is_warned_of(tmp_path: Pa
     assert found["warnings"] == []
 
 
+def test_a_missing_rotation_is_told_with_an_example(tmp_path: Path) -> None:
+    status, _, said = run(tmp_path, "", "", "--u-reference-pct=1")
+    assert status == 2
+    assert "a tri-axial reference needs --rotation, its orientation against the sensor; where the axes" in said
+
+
 def test_a_sensitivity_with_a_comma_and_none_at_all(tmp_path: Path) -> None:
     _, _, reference_s, a = world()
     volts = table("time,AI0 (mV)", seconds(reference_s), a[:, :1])
