@@ -13,7 +13,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import time
 from pathlib import Path
 
-from agent.acquisition.reader import EventQueue, Reader
+from agent.acquisition.reader import DeviceReader, EventQueue
 from agent.config import load_config
 from agent.core.events import RunStart
 from agent.recording.writer import Recorder
@@ -29,7 +29,9 @@ def main() -> None:
     events = EventQueue(len(config.devices))
     for device in config.devices:
         driver = load_driver(device.driver)
-        Reader(device.name, driver(device.name, driver.options_model.model_validate(device.options)), events).start()
+        DeviceReader(
+            device.name, driver(device.name, driver.options_model.model_validate(device.options)), events
+        ).start()
     now_ns = time.monotonic_ns()
     start = RunStart(
         run_id="bare", site="", gateway="", boot_id=boot_id(), t_monotonic_ns=now_ns, t_utc_ns=time.time_ns(),

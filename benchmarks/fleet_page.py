@@ -4,7 +4,8 @@ Router, monitor and browser run on this machine; the monitor is a process of its
 opens a new browser context: time from navigation to the first cards and rows painted, bytes until then and 2 s later
 (as they come over the wire), time from a result on the bus to the page, tasks above 50 ms while the table is scrolled,
 and layout shifts that no person's input caused: until the change, by the change (its card is told and comes in when it
-is asked for, by a click), and while scrolling. The median of the runs counts; `--write` puts it into docs/fleet.md.
+is asked for, by a click), and while scrolling. The median of the runs counts; `--write` puts it into
+docs/fleet-evidence.md.
 """
 
 from __future__ import annotations
@@ -100,7 +101,7 @@ def main() -> None:
     """Measure, and print or write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--write", action="store_true", help="put the table into docs/fleet.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/fleet-evidence.md")
     args = parser.parse_args()
     site = Site()
     kinds = behaviours(GATEWAYS, SEED)

@@ -102,7 +102,7 @@ class EventQueue:
         ]
 
 
-class Reader(threading.Thread):
+class DeviceReader(threading.Thread):
     """Opens a device and reads it until `stop`. Where the device is lost it opens it again, with growing pauses.
 
     The driver may be a third party's, and may have a bug. What it returns is checked, what it raises is caught, and
@@ -281,7 +281,7 @@ class Reader(threading.Thread):
         )
 
 
-def reader_of(device: Device, events: EventQueue, plan: SelfTestPlan | None = None) -> Reader:
+def reader_of(device: Device, events: EventQueue, plan: SelfTestPlan | None = None) -> DeviceReader:
     """The reader of a device of a configuration that has passed its check. `plan` of its self-tests.
 
     Raises ConfigurationError if its driver cannot be made with these options.
@@ -295,4 +295,4 @@ def reader_of(device: Device, events: EventQueue, plan: SelfTestPlan | None = No
     except (Exception, SystemExit) as error:
         told = f"{device.name}: {IN_DRIVER} {device.driver!r}: it cannot be made: {as_driver_fault(error)}"
         raise ConfigurationError(told) from error
-    return Reader(device.name, sensor, events, SelfTesting(plan) if plan is not None else None)
+    return DeviceReader(device.name, sensor, events, SelfTesting(plan) if plan is not None else None)

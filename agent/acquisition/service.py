@@ -12,7 +12,7 @@ from pathlib import Path
 
 from agent import __version__
 from agent.acquisition.arena import one_arena, return_free
-from agent.acquisition.reader import EventQueue, Reader, reader_of
+from agent.acquisition.reader import DeviceReader, EventQueue, reader_of
 from agent.acquisition.stalls import few_objects
 from agent.acquisition.weighing import Weighing
 from agent.audit.recalling import memories_of
@@ -135,7 +135,7 @@ class Service:
             epoch=self._store.epoch,
         )
 
-    def _end(self, readers: Sequence[Reader], writer: RecordingThread) -> None:
+    def _end(self, readers: Sequence[DeviceReader], writer: RecordingThread) -> None:
         """End what `run` has begun: first what brings events, last the store."""
         self._supervisor.closing()
         if self._reception is not None:
@@ -235,7 +235,7 @@ class Service:
         )
 
     def _loop(
-        self, events: EventQueue, writer: RecordingThread, readers: Sequence[Reader], duration_s: float | None
+        self, events: EventQueue, writer: RecordingThread, readers: Sequence[DeviceReader], duration_s: float | None
     ) -> None:
         by_device, refused = {reader.device: reader for reader in readers}, dict[str, str]()
         next_tick = time.monotonic() + TICK_S

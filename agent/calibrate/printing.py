@@ -10,6 +10,7 @@ from agent.terminal.text import one_line, say
 from calib.model import Window
 from calib.recorded.measurement_result import NuisanceValue
 from calib.recorded.outcome import Outcome
+from calib.recorded.table import FIRST_DATE_S, moment
 from calib.recorded.told import lines_of
 
 
@@ -50,4 +51,11 @@ def _print_windows(windows: Sequence[Window]) -> None:
     for w in windows:
         left = f", {w.left_out} left out" if w.left_out else ""
         verdict = f"{w.points} points{left}" if w.used else f"not used: {w.reason}"
-        say(f"  {w.start_s:10.3f} to {w.stop_s:10.3f} s  {w.pose.position}: {verdict}")
+        say(f"  {_span(w)}  {w.pose.position}: {verdict}")
+
+
+def _span(w: Window) -> str:
+    """From when to when: in s, or as dates where the times count since 1970."""
+    if w.start_s < FIRST_DATE_S:
+        return f"{w.start_s:10.3f} to {w.stop_s:10.3f} s"
+    return f"{moment(w.start_s)} to {moment(w.stop_s)}"

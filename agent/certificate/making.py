@@ -42,7 +42,7 @@ def certificate_of(
     result = material.results[0]
     source = material.files[0].path if material.files else "the input"
     result = replace(result, unit=_unit(result.unit, stated.instrument.output_unit, source))
-    stated = _with_reference_name(stated, result.fields.get("reference_quantity"))
+    stated = _with_reference_name(stated, result)
     residuals, levels = tuple(seen), _levels(material)
     known = np.isfinite(result.values) & np.isfinite(result.expanded_uncertainty)
     if not any(np.isfinite(result.covariance[k][known]).all() for k in np.flatnonzero(known)):
@@ -121,8 +121,17 @@ def _unit(told: str, stated: str, source: str) -> str:
     return told or named
 
 
-def _with_reference_name(stated: CertificateStatements, quantity: object) -> CertificateStatements:
-    """The statements with a name of the reference, by what it gives, where none is stated."""
+def _with_reference_name(stated: CertificateStatements, result: CalibrationResult) -> CertificateStatements:
+    """The statements with a name of the reference, by what it gives, where none is stated.
+
+    Raises CertificateError where gravity was the only excitation: then no instrument was used.
+    """
+    quantity, used = result.fields.get("reference_quantity"), [w for w in result.windows if w.used]
+    if not stated.reference.name and quantity is None and used and all(w.kind == "rest" for w in used):
+        raise CertificateError(
+            "reference.name: is missing; gravity was the only excitation, so the reference is no instrument: state "
+            "name = 'local gravity', and in the other entries where its value comes from (docs/certificate.md)"
+        )
     named = stated.reference.name or reference_name(quantity)
     return stated.model_copy(update={"reference": stated.reference.model_copy(update={"name": named})})
 

@@ -59,7 +59,9 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
 )
 @click.option("--reference-quantity", type=_choice("reference_quantity"), help="Default: by the header.")
 @click.option(
-    "--reference-coupling", type=_choice("reference_coupling"), help="Default: ac for one axis, dc for three."
+    "--reference-coupling",
+    type=_choice("reference_coupling"),
+    help="Default: dc for three axes that feel gravity, else ac.",
 )
 @click.option(
     "--coupling", type=_choice("coupling"), default=DEFAULTS.coupling, show_default=True, help="Coupling of the sensor."

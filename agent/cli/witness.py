@@ -26,7 +26,7 @@ from agent.delivery.keys import PREFIX, parse_key
 from agent.delivery.session import EndpointError, closed_in_time, session_config
 from agent.keys.files import write_new
 from agent.recording.signing import Signer, load_public_key
-from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
+from agent.recording.witness import KEY_NAME, PUBLIC_NAME, ChainWitness, WitnessError
 from agent.terminal.text import say
 
 INBOX = 1000  # heads that may wait; the oldest are dropped, and each gateway publishes a new one within a minute
@@ -70,7 +70,7 @@ def witness(
     stop = StopRequest.by_signals()
     files = tls.files(endpoints)
     try:
-        kept = Witness(directory, _signer(directory), _keys(public_keys, known_keys), time.time_ns)
+        kept = ChainWitness(directory, _signer(directory), _keys(public_keys, known_keys), time.time_ns)
         config = session_config("client", connect=endpoints, tls=files)
     except (KeyFileError, EndpointError, WitnessError) as error:
         say(f"fieldcal witness: {error}", err=True)
@@ -96,7 +96,7 @@ def _keys(public_keys: Sequence[Path], known_keys: Path | None) -> Callable[[], 
     return lambda: replace(watched.now(), anywhere=anywhere)
 
 
-def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) -> int:
+def _follow(session: zenoh.Session, key: str, kept: ChainWitness, stop: StopRequest) -> int:
     faults: list[OSError] = []
 
     def take_all() -> None:
@@ -128,7 +128,7 @@ def _follow(session: zenoh.Session, key: str, kept: Witness, stop: StopRequest) 
     return 1 if faults or not heard else 0
 
 
-def _keep_heads(subscriber: AdvancedSubscriber[Any], kept: Witness) -> None:
+def _keep_heads(subscriber: AdvancedSubscriber[Any], kept: ChainWitness) -> None:
     """Take each head that comes, and say which are not kept. Raises OSError where a disk fails that is not full."""
     refused, silent_until_s = 0, -math.inf
     for sample in subscriber:

@@ -21,7 +21,7 @@ UNIT_TOLERANCE = 1e-3
 GRAVITY_MPS2 = (9.7, 9.9)
 
 
-class Pose(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class PoseArguments(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The sensor's position from now on: clamp angles, or the motion's direction, or gravity alone (a rest)."""
 
     theta_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)] | None = None
@@ -64,9 +64,9 @@ class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sequence: Sequence
 
 
-Arguments = Pose | Hold | Accept | Rollback
+Arguments = PoseArguments | Hold | Accept | Rollback
 _DECODERS: dict[Verb, msgspec.json.Decoder[Arguments]] = {
-    "pose": msgspec.json.Decoder(Pose),  # made during the import, as agent.delivery.record says
+    "pose": msgspec.json.Decoder(PoseArguments),  # made during the import, as agent.delivery.record says
     "hold": msgspec.json.Decoder(Hold),
     "accept": msgspec.json.Decoder(Accept),
     "rollback": msgspec.json.Decoder(Rollback),

@@ -11,7 +11,7 @@ import msgspec
 
 from agent.config.files import read_file
 from agent.fleet.exporting import Exported, stem
-from agent.fleet.task import UNCHANGED, Task
+from agent.fleet.task import UNCHANGED, RecordingTask
 from agent.fleet.workers import DaskWorkers, LocalWorkers
 
 LARGEST_RESULT = 1 << 30  # bytes of a result that is read again; a larger one is computed anew
@@ -61,7 +61,7 @@ def results_of(
     """
     known: dict[str, Summary] = {}  # of the tasks that are given out
 
-    def tasks() -> Iterator[Task]:
+    def tasks() -> Iterator[RecordingTask]:
         for place in places:
             before = _read(directory, place) if directory is not None else None
             if before is not None and before.reasons and export:  # a library may be there now that was missing
@@ -69,7 +69,7 @@ def results_of(
             if before is not None:
                 known[place] = _summary(before)
             made = (before.sha256, before.made_by) if before is not None else ("", "")
-            yield Task(
+            yield RecordingTask(
                 place=place, settings=tuple(settings), audit=audit, known=made, export=export,
                 directory=str(directory) if export else "",
             )  # fmt: skip

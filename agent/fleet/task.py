@@ -24,7 +24,7 @@ from agent.recording.reading import open_recording
 UNCHANGED = b""  # in place of a result: the one that is known still holds
 
 
-class Task(msgspec.Struct, frozen=True, kw_only=True):
+class RecordingTask(msgspec.Struct, frozen=True, kw_only=True):
     """What is to be done. Everything in it may be written to a log: it holds no credentials.
 
     `place`: a path or an address. `settings`: as `ChangedSetting.of` reads them. `known`: the fields `sha256` and
@@ -58,7 +58,7 @@ class FileResult(msgspec.Struct, kw_only=True):
     exported: list[Exported] = []
 
 
-def run_task(task: Task) -> bytes:
+def run_task(task: RecordingTask) -> bytes:
     """The FileResult of a recording as JSON; UNCHANGED where the known result holds. The same bytes on every worker
     that has the same fingerprint. What is wrong with the recording is in the result; a MemoryError is raised."""
     from threadpoolctl import threadpool_limits
@@ -67,7 +67,7 @@ def run_task(task: Task) -> bytes:
     return msgspec.json.encode(found) if (found := _result(task)) is not None else UNCHANGED
 
 
-def _result(task: Task) -> FileResult | None:
+def _result(task: RecordingTask) -> FileResult | None:
     from agent.recording.fingerprint import fingerprint
 
     here = fingerprint()
@@ -154,6 +154,6 @@ def _reasons(file: ReplayedFile) -> list[str]:
     return reasons
 
 
-def _made_by(task: Task, here: dict[str, str]) -> str:
+def _made_by(task: RecordingTask, here: dict[str, str]) -> str:
     held: list[Any] = [__version__, task.audit, task.export, list(task.settings), sorted(here.items())]
     return hashlib.sha256(msgspec.json.encode(held)).hexdigest()

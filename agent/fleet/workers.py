@@ -15,11 +15,11 @@ from multiprocessing.connection import wait as wait_for_end
 from types import TracebackType
 from typing import Any
 
-from agent.fleet.task import Task, run_task
+from agent.fleet.task import RecordingTask, run_task
 
 IN_FLIGHT = 2  # tasks given out for each worker: the second one waits there, so that no worker is idle
 CONNECT_S = 10.0  # s to reach a Dask scheduler
-Done = tuple[Task, bytes | str]
+Done = tuple[RecordingTask, bytes | str]
 """A task with its result, or the sentence why it has none."""
 _TASKS = multiprocessing.get_context("spawn")
 
@@ -35,11 +35,11 @@ class LocalWorkers(AbstractContextManager["LocalWorkers"]):
         self._count = count
         self._pool = self._new_pool(count)
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Done]:
+    def run(self, tasks: Iterable[RecordingTask]) -> Iterator[Done]:
         """Each task with its result, as they come. A task that ends its process is tried once more, alone."""
-        waiting, open_tasks = iter(tasks), dict[Future[bytes], Task]()
+        waiting, open_tasks = iter(tasks), dict[Future[bytes], RecordingTask]()
         while True:
-            lost: list[Task] = []
+            lost: list[RecordingTask] = []
             for task in islice(waiting, IN_FLIGHT * self._count - len(open_tasks)):
                 try:
                     open_tasks[self._pool.submit(run_task, task)] = task
@@ -66,7 +66,7 @@ class LocalWorkers(AbstractContextManager["LocalWorkers"]):
                 process.terminate()
         self._pool.shutdown(cancel_futures=True)
 
-    def _alone(self, tasks: Iterable[Task]) -> Iterator[Done]:
+    def _alone(self, tasks: Iterable[RecordingTask]) -> Iterator[Done]:
         """Each task in a new process of its own, so that only the one that ends its process is lost."""
         self._pool.shutdown(cancel_futures=True)
         for task in tasks:
@@ -95,11 +95,11 @@ class DaskWorkers(AbstractContextManager["DaskWorkers"]):
         except (OSError, ValueError, TimeoutError) as error:
             raise SchedulerError(f"{address}: no Dask scheduler answers there: {error}") from None
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Done]:
+    def run(self, tasks: Iterable[RecordingTask]) -> Iterator[Done]:
         """Each task with its result, as they come. Dask gives a task of a lost worker to another one, three times."""
         from distributed import as_completed
 
-        waiting, open_tasks = iter(tasks), dict[Any, Task]()
+        waiting, open_tasks = iter(tasks), dict[Any, RecordingTask]()
         completed = as_completed(loop=self._client.loop)
         while True:
             room = IN_FLIGHT * max(1, sum(self._client.nthreads().values())) - len(open_tasks)

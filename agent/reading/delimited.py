@@ -206,8 +206,9 @@ def _rows_alone(text: bytes, dialect: Dialect) -> bytes:
 def fields_of(path: Path, line: int, fields: list[str], header: Sequence[str]) -> list[str]:
     """The fields. Raises TableError if their number is not that of the header."""
     if len(fields) != len(header):
+        commas = "; where commas are decimal marks too, separate the fields by semicolons" * (len(fields) > len(header))
         raise TableError(
-            f"{path}, line {line}: {len(fields)} fields, but the header has {len(header)}; correct the line"
+            f"{path}, line {line}: {len(fields)} fields, but the header has {len(header)}; correct the line{commas}"
         )
     return fields
 

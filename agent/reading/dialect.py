@@ -241,7 +241,7 @@ def _before(
         before = _in_comment(lines, first_line, delimiter, width)
     if not before and above and len(above[-1][1]) > 1 and not any(map(_is_value, above[-1][1])):
         before = [above[-1]]  # the rows have another number of fields, which their reader tells
-        width = max(width, len(_stripped(before[0][1])))
+        width = len(_stripped(before[0][1]))
     if before and len(before[-1][1]) != width and _is_counted(rows):
         width = len(before[-1][1])
     return before, width

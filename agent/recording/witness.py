@@ -235,7 +235,7 @@ class HeadFile:
             raise WitnessError(f"{where}: {error}") from None
 
 
-class Witness:
+class ChainWitness:
     """Keeps heads in a directory. `clock`: UTC in ns.
 
     `keys`: gives the list of known keys as it is now; without it, a gateway's first key counts, and GATEWAYS_MAX

@@ -13,7 +13,7 @@ from pathlib import Path
 
 # What each part is for.
 PURPOSES = {
-    "report": "figures of `fieldcal report`",
+    "report": "figures of `fieldcal report`, the PDF of `fieldcal certificate`",
     "files": "Parquet and Feather files, and large CSV files read faster",
     "hdf5": "HDF5 and MATLAB 7.3 files",
     "seismic": "MiniSEED and StationXML files",

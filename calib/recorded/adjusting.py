@@ -86,15 +86,26 @@ def adjusted(
         told = _adjusted(tables, priors)
     outcome, found = _at_rest(told, priors)
     outcome = _with_remedy(outcome, tables, priors)
-    outcome = replace(outcome, more={**outcome.more, "band_hz": band_hz})
+    offset_s = 0.0 if _is_lost(outcome.windows) else tables.offset_s
+    outcome = replace(outcome, more={**outcome.more, "band_hz": band_hz, "clock_offset_s": offset_s})
+    if offset_s:
+        outcome = replace(outcome, warnings=(_offset_warning(offset_s),))
     if found is not None and found.across.motion:
-        outcome = replace(outcome, warnings=(_across_warning(found.across, priors.transverse),))
+        outcome = replace(outcome, warnings=(*outcome.warnings, _across_warning(found.across, priors.transverse)))
     if found is None or (share := found.share) is None:
         return outcome
     if certificate is not None:
         share = replace(share, sensitivity=certificate.sensitivity)
     identity = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
     return replace(outcome, more={**outcome.more, "shared_errors": [share.as_object(*identity)]})
+
+
+def _offset_warning(offset_s: float) -> str:
+    told = "ahead of" if offset_s > 0.0 else "behind"
+    return (
+        f"the clock of the sensor is {abs(offset_s):.2f} s {told} that of the reference, as the motion shows; this was "
+        "taken out. Check that both files are of the same motion"
+    )
 
 
 def _across_warning(across: Across, stated: float) -> str:
@@ -234,6 +245,7 @@ class _Search:
 
         If none can be used the sensor may be far too late, or a response may look like a mean that changes. If the lags
         that they show are still large, the two clocks run apart. The lag that they lead to may also be another one.
+        Where hardly any can be used even so, the two clocks may be seconds apart.
         """
         flat = Applied(self._priors.lag_at_s, self._priors.reference_corner_at_hz, self._priors.sensor_corner_at_hz)
         applied = self.make(flat)
@@ -243,6 +255,8 @@ class _Search:
             elsewhere = abs(lag_s - applied.lag_s) * largest_omega(self.windows) > EIGHTH_RAD
             if lost or elsewhere or self._tables.rate != rate:
                 applied = self.make(replace(flat, lag_s=lag_s))
+        if _is_lost(self.windows) and self._join_clocks():
+            return self.begin()
         if _used(self.windows):
             return applied
         refused = self.windows
@@ -250,6 +264,14 @@ class _Search:
         response = self.at(self.windows, taken).response if _used(self.windows) else None
         self.windows = refused
         return applied if response is None else replace(taken, response=_next_response(response.terms))
+
+    def _join_clocks(self) -> bool:
+        """Take out by how much the two clocks are apart; whether that was not done before."""
+        omega = largest_omega(self.windows)
+        if not omega or not self._tables.join_clocks(max(EIGHTH_RAD / omega, 2.0 / self._tables.rate_hz)):
+            return False
+        self.stated, self.narrower, self._latest = self._priors, (), None
+        return True
 
     def _may_be_another_lag(self, taken: Applied) -> bool:
         """Whether the outputs may follow the reference better at another lag: half a period away from the right one, a
@@ -305,6 +327,11 @@ def _next_response(found: Response, taken: Response = FLAT) -> Response:
     """What to take out after a turn that found this response. Terms below the motion that were taken out stay: without
     their filter the windows would be longer ones again, and the search could go to and fro between both."""
     return (found if taken.from_hz else found.without_slight_below).modest
+
+
+def _is_lost(windows: Sequence[Window]) -> bool:
+    """Whether no window can be used, or almost none of the motion."""
+    return not _used(windows) or bool(_hardly_used(windows))
 
 
 def _hardly_used(windows: Sequence[Window]) -> tuple[str, ...]:

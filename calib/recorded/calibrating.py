@@ -17,13 +17,13 @@ from calib.recorded.adjusting import adjusted, norm_fitted
 from calib.recorded.amplitude_methods import by_amplitudes
 from calib.recorded.causes import causes, silent_channels
 from calib.recorded.errors import InputError, OptionError
-from calib.recorded.options import Options
+from calib.recorded.options import Coupling, Options
 from calib.recorded.outcome import Outcome, nothing_used
 from calib.recorded.poses import PoseInterval, Poses, PoseSettings, beside_reference, intervals_of
 from calib.recorded.priors import contradictions, instrument_of, priors_of
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.recorded.tables import Making, Tables
-from calib.recorded.wrong_unit import check_gravity, gravity_warnings
+from calib.recorded.wrong_unit import check_gravity, gravity_warnings, measures_gravity, unconfirmed_unit
 from calib.signal.instrument import Instrument
 
 CORNERS_ALIKE = (
@@ -50,6 +50,8 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
         told.append(CORNERS_ALIKE)
     if reference is not None and _setting(options, reference).reference_coupling == "dc":
         told += gravity_warnings(reference)
+    elif reference is not None and options.reference_coupling is None:
+        told += unconfirmed_unit(reference)
     return replace(outcome, warnings=tuple(told))
 
 
@@ -116,10 +118,14 @@ def _setting(options: Options, reference: ReferenceTable | None) -> PoseSettings
         gravity_mps2=options.gravity or STANDARD_GRAVITY_MPS2,
         static_sign=options.static_sign,
         coupling=options.coupling,
-        reference_coupling=options.reference_coupling or ("dc" if channels == 3 else "ac"),
+        reference_coupling=options.reference_coupling or _usual_coupling(reference),
         reference_channels=channels,
         rotation=options.rotation,
     )
+
+
+def _usual_coupling(reference: ReferenceTable | None) -> Coupling:
+    return "dc" if reference is not None and measures_gravity(reference) else "ac"
 
 
 def _intervals(poses: Poses | None, setting: PoseSettings, reference: ReferenceTable | None) -> list[PoseInterval]:

@@ -17,6 +17,9 @@ BLOCKS, BLOCK = 200, 500
 STUCK_SHARE = 0.1  # of the blocks
 SILENT = 0.02  # rms of a channel over that of the strongest; a sensor that moves in a plane has outputs as silent
 MOVES = 0.2
+# What loggers write for a missing value, where it is that many times what nine of ten values are at most.
+MISSING_AS = (-999.0, 999.0, -9999.0, 9999.0, -99999.0, 99999.0, -32768.0, 32767.0, -6999.0, 7999.0)
+FAR, USUALLY = 10.0, 0.9
 MILLI, AROUND = 1000.0, 1.2  # a second in ms; ratio by which recordings of one motion may differ in length
 SLOWEST_HZ = 5.0  # a sampling rate below is too low for most motions: then the times may be in ms
 FULL_TURN_RAD, UPRIGHT_RAD = 2.0 * math.pi, 0.5 * math.pi
@@ -28,6 +31,7 @@ def causes(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses |
         *_times(sensor, reference, poses, outcome),
         *([] if poses is None else _angles(poses)),
         *_stuck(sensor),
+        *_missing(sensor),
     ]
 
 
@@ -84,6 +88,19 @@ def _stuck(sensor: SensorTable) -> Iterator[str]:
             f"output {'xyz'[k]} of {sensor.name} is stuck: it does not change at all in {share[k]:.0%} of the "
             "recording, while another output does; check its wiring, or leave this time out of the poses"
         )
+
+
+def _missing(sensor: SensorTable) -> Iterator[str]:
+    """Numbers that stand for a missing value."""
+    rows = np.concatenate(list(_blocks(sensor.v)) or [np.empty((0, 3))])
+    for k, column in enumerate(rows.T):
+        found, counts = np.unique(column[np.isin(column, MISSING_AS)], return_counts=True)
+        for value, count in zip(found.tolist(), counts.tolist(), strict=True):
+            if count > 1 and abs(value) > FAR * float(np.quantile(np.abs(column), USUALLY)):
+                yield (
+                    f"output {'xyz'[k]} of {sensor.name} is {value:g} in {100 * count / len(column):.2g} % of the "
+                    "recording: if this stands for a missing value, leave the field empty"
+                )
 
 
 def silent_channels(sensor: SensorTable, reference: ReferenceTable, rotation: Array) -> list[str]:

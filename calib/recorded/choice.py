@@ -25,6 +25,11 @@ QUANTITY_WORDS = {
 _OTHER_AXES = re.compile(r"(gyr|mag|ang|rot|quat|eul|vel|pos|disp|orient|cov|omega|grav)")
 _AXIS = re.compile(r"(?:a|v|s|acc|accel|acceleration|accelerometer)?([xyz])")
 AXES = ("x", "y", "z")
+# Columns of a seismometer: E, N, Z, or with the codes of band and instrument before (SEED), as HNE.
+_COMPASS = {
+    "x": re.compile(r"e|east|[a-z][hlng]e"), "y": re.compile(r"n|north|[a-z][hlng]n"),
+    "z": re.compile(r"z|u|up|vertical|[a-z][hlng]z"),
+}  # fmt: skip
 Result = TypeVar("Result")
 
 
@@ -177,11 +182,26 @@ class Choice:
         return found
 
     def guessed(self, role: str) -> ChosenColumn | None:
-        """The only column whose name tells that it is `role`: time, x, y, z, temperature. None where none does."""
-        found = [c for c in self._columns if _role(c) == role]
+        """The only column whose name tells that it is `role`: time, x, y, z, temperature. None where none does.
+
+        East, north and up are x, y and z where all three are there.
+        """
+        found = [self._compass[role]] if role in self._compass else [c for c in self._columns if _role(c) == role]
         if len(found) > 1:
             raise self.fault(f"several columns could be {role}: {', '.join(repr(str(c)) for c in found)}")
         return ChosenColumn(found[0], _unit(found[0])) if found else None
+
+    @property
+    def _compass(self) -> dict[str, Column]:
+        """The columns of east, north and up as x, y and z; empty where one of them is missing or not the only one, and
+        where others are called x and y."""
+        if any(_role(c) in ("x", "y") for c in self._columns):
+            return {}
+        found = {
+            axis: [c for c in self._columns if way.fullmatch((words(split(c.name)[0]) or [""])[-1])]
+            for axis, way in _COMPASS.items()
+        }
+        return {axis: of[0] for axis, of in found.items()} if all(len(of) == 1 for of in found.values()) else {}
 
     def rest(self, taken: Sequence[ChosenColumn]) -> list[ChosenColumn]:
         """The columns that are not taken and that are neither times nor temperatures."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from calib.recorded.choice import AXES, Choice, ChosenColumn, quantity_of
+from calib.recorded.errors import InputError
 from calib.recorded.table import REFERENCES, SENSOR
 from calib.recorded.units import Sensitivity, unit_of
 
@@ -95,8 +96,10 @@ def si_of(choice: Choice, chosen: ChosenColumn, sensitivity: Sensitivity | None)
                 f"column {str(chosen.column)!r} is in {chosen.unit}, convert it to m/s2, m/s or m: it is"
             )
         if unit is not None and unit.quantity in ELECTRICAL:
-            raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit}, so `sensitivity` is needed, "
-                               "for example `sensitivity` '100 mV/g'")  # fmt: skip
+            raise InputError(
+                f"column {str(chosen.column)!r} is in {chosen.unit}, and its sensitivity is not stated",
+                "state it as its certificate does: `sensitivity` '100 mV/g'", place=choice.place,
+            )  # fmt: skip
         return 1.0 if unit is None else unit.si
     if unit is not None and unit.quantity not in ELECTRICAL:
         raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit} already; remove `sensitivity`")

@@ -50,10 +50,11 @@ class Outcome(MeasurementResult):
 
 
 def nothing_used(windows: Sequence[Window], rate_hz: float, method: str) -> Outcome:
-    """The outcome if no window can be used. Its reason names the number of windows, and why the first is not used."""
+    """The outcome if no window can be used. Its reason names the number of windows, and why the longest is not used."""
     wanted = [w for w in windows if w.kind != "quiet"] or windows
-    first = f"; the first of them ({wanted[0].pose.position}): {wanted[0].reason}" if wanted else ""
-    return Outcome(None, (f"none of the {len(wanted)} windows can be used{first}",), windows, rate_hz, method)
+    longest = max(wanted, key=lambda w: w.stop_s - w.start_s, default=None)
+    why = "" if longest is None else f"; the longest of them ({longest.pose.position}): {longest.reason}"
+    return Outcome(None, (f"none of the {len(wanted)} windows can be used{why}",), windows, rate_hz, method)
 
 
 def as_json(outcome: Outcome) -> str:

@@ -139,7 +139,10 @@ def pose_of(row: PoseRow, setting: PoseSettings) -> Pose:
 def beside_reference(setting: PoseSettings, gravity: Sequence[float] | None = None) -> Pose:
     """The pose beside a tri-axial reference; `gravity` as its row states it, None if it is not stated there."""
     if setting.rotation is None:
-        raise ValueError("a tri-axial reference needs `rotation`, its orientation against the sensor")
+        raise ValueError(
+            "a tri-axial reference needs `rotation`, its orientation against the sensor; where the axes are parallel: "
+            "1,0,0,0,1,0,0,0,1 as an option, a unit matrix in a notebook"
+        )
     if setting.coupling == "dc" and setting.reference_coupling == "dc":
         return beside(setting.rotation, NOT_FELT)
     if setting.coupling == "ac" and setting.reference_coupling == "dc":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,8 +22,10 @@ class TableStream:
     def __init__(self, name: str, time_s: Slices, values: Slices) -> None:
         self._name, self._values = name, values
         self.axes = int(values[:1].shape[1])  # number of columns of values
+        self.moved_s = 0.0
         self.clock: ClockFit
         self.clock, self._rows, self._numbers = counted(clock_from_stamps(time_s))
+        self._fitted = self.clock
 
     @property
     def _count(self) -> int:
@@ -46,6 +49,12 @@ class TableStream:
     def stretch(self, rate: float, at_s: float) -> None:
         """Change the times of the samples to a scale that runs faster by `rate`, see ClockFit.stretched."""
         self.clock = self.clock.stretched(rate, at_s)
+
+    def move(self, by_s: float) -> None:
+        """Make the times of the samples later by `by_s` than the clock that is fitted to their stamps."""
+        at = self._fitted
+        self.moved_s = by_s
+        self.clock = replace(at, knot_time_s=at.knot_time_s + by_s, offset_s=at.offset_s + by_s)
 
     def cut(self, start_s: float, stop_s: float) -> Samples | None:
         """The samples with start_s <= t < stop_s, a row of NaN for each one that is missing between them; None if there

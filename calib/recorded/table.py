@@ -25,6 +25,7 @@ REFERENCES = {
 LATEST_STAMP_S = 0.1
 ROWS_AT_ONCE = 1 << 20
 FEWEST_ROWS = 2
+FIRST_DATE_S = 1e8  # three years after 1970; no recording that counts from its begin is so long
 LAST_S = 1e11  # in the year 5138; a later time is in another unit
 # From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
 SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
@@ -72,6 +73,13 @@ class ReferenceTable:
     def place(self) -> str:
         """Where its columns are named, for messages."""
         return f"{self.name}, {self.header}" if self.header else self.name
+
+
+def moment(time_s: float) -> str:
+    """A time for messages: in s, or as a date with time of day where it counts since 1970."""
+    if time_s < FIRST_DATE_S:
+        return f"{time_s:.10g} s"
+    return str(np.datetime64(round(1000.0 * time_s), "ms")).replace("T", " ")
 
 
 def second_of(first: float) -> float:

@@ -25,11 +25,12 @@ from calib.excitation.pieces import pieces_of
 from calib.excitation.windows import Points, motion_windows, rest_sd
 from calib.model import Array, Window
 from calib.recorded.alignment import drift
+from calib.recorded.clock_offset import clock_offset
 from calib.recorded.errors import InputError
 from calib.recorded.poses import PoseInterval
 from calib.recorded.segments import segments_joined, with_joined
 from calib.recorded.streams import TableStream
-from calib.recorded.table import ReferenceTable, SensorTable, ends_s
+from calib.recorded.table import FIRST_DATE_S, ReferenceTable, SensorTable, ends_s, moment
 from calib.signal.band import HALVED, STOP_BAND
 from calib.signal.instrument import Instrument
 from calib.signal.response import FLAT, Response
@@ -136,6 +137,28 @@ class Tables:
         if rate:
             self._stretch(rate, at_s)
         return lag_s
+
+    @property
+    def offset_s(self) -> float:
+        """By how much the reference's times were moved, because the sensor's clock shows so much more; 0 if not."""
+        return 0.0 if self._reference is None else self._reference.moved_s
+
+    def join_clocks(self, near_s: float) -> bool:
+        """Move the reference's times by the offset of the two clocks, where it is more than `near_s` and was not moved
+        before; whether it was. Offsets of parts of the recording that differ by `near_s` at most agree."""
+        if self._reference is None or not self._making.align or self.offset_s:
+            return False
+        before, (first_s, end_s) = (self._reference.clock, self.rate), self._sensor.span_s
+        self._reference.move(0.0)
+        found = clock_offset(self._stretches(), end_s - first_s, MOST_RATE, near_s)
+        if found is None or abs(found[0]) <= near_s:
+            self._reference.clock, self.rate = before
+            return False
+        offset_s, self.rate, at_s = found
+        self._reference.move(offset_s)
+        self._reference.stretch(self.rate, at_s)
+        self._phase_rad = np.inf
+        return True
 
     def _stretch(self, rate: float, at_s: float) -> None:
         assert self._reference is not None
@@ -302,8 +325,13 @@ def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses:
     if poses:
         spans.append(("the poses", min(p.start_s for p in poses), max(p.stop_s for p in poses)))
     if max(s for _, s, _ in spans) >= min(e for _, _, e in spans):
-        told = ", ".join(f"{name} from {start:.10g} s to {stop:.10g} s" for name, start, stop in spans)
-        raise InputError("they do not overlap in time", f"their times must be on one scale: {told}")
+        told = ", ".join(f"{name} from {moment(start)} to {moment(stop)}" for name, start, stop in spans)
+        raise InputError("they do not overlap in time", f"their times must be on one scale: {told}{_zone(spans)}")
+
+
+def _zone(spans: Sequence[tuple[str, float, float]]) -> str:
+    """A hint where all times are dates; they may be those of different zones."""
+    return "; a date without a zone is taken as UTC" if min(start for _, start, _ in spans) > FIRST_DATE_S else ""
 
 
 def _interpolated(at_s: Array, time_s: Array, values: Array) -> Array:

@@ -27,15 +27,21 @@ _SPELLINGS = {
     ("time", 3600.0): "h hr hrs hour hours",
     ("time", 86400.0): "day days",
     ("acceleration", 1.0): "m/s2 m/s^2 m/s**2 m/s/s mps2 ms-2 ms^-2 m·s-2 m.s-2 m*s^-2",
-    ("acceleration", 1e-3): "mm/s2 mm/s^2",
     ("acceleration", 1e-2): "cm/s2 cm/s^2 gal",
+    ("acceleration", 1e-3): "mm/s2 mm/s^2",
+    ("acceleration", 1e-5): "mgal",
+    ("acceleration", 1e-6): "µm/s2 um/s2 µm/s^2 um/s^2",
+    ("acceleration", 1e-9): "nm/s2 nm/s^2",
     ("acceleration", STANDARD_GRAVITY_MPS2): "g gn g0 g_n grav",
     ("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2): "mg milli-g millig mgn",
     ("acceleration", 1e-6 * STANDARD_GRAVITY_MPS2): "µg ug",
     ("velocity", 1.0): "m/s mps",
     ("velocity", 1e-2): "cm/s",
     ("velocity", 1e-3): "mm/s",
+    ("velocity", 1e-6): "µm/s um/s",
+    ("velocity", 1e-9): "nm/s",
     ("displacement", 1.0): "m",
+    ("displacement", 1e-2): "cm",
     ("displacement", 1e-3): "mm",
     ("displacement", 1e-6): "µm um",
     ("indication", 1e3): "V volt volts",  # of the electrical units the base is 1 mV
@@ -112,7 +118,8 @@ def sensitivity_of(text: str) -> Sensitivity:
     found = re.fullmatch(r"\s*([-+.\deE]+)\s*(?:([^\s\d/(]+)\s*/\s*(\S.*))?", text)
     value = float(found[1]) if found else 0.0
     if not found or not 0.0 < abs(value) < 1e15:
-        raise ValueError(f"{text!r} is not a sensitivity; write it as 100 mV/g or 10.2 mV/(m/s2)")
+        point = ", with a point as the decimal mark" if "," in text else ""
+        raise ValueError(f"{text!r} is not a sensitivity; write it as 100 mV/g or 10.2 mV/(m/s2){point}")
     if not found[2]:
         return Sensitivity(value, "", "acceleration", 1.0)
     indication, per = unit_of(found[2]), unit_of(found[3])

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from calib.geometry import STANDARD_GRAVITY_MPS2
+from calib.model import Array
 from calib.recorded.errors import UnitError
 from calib.recorded.table import ReferenceTable
 
@@ -61,22 +62,56 @@ def gravity_warnings(reference: ReferenceTable) -> list[str]:
     ]
 
 
+def unconfirmed_unit(reference: ReferenceTable) -> list[str]:
+    """A sentence where neither gravity nor anybody tells the unit of a tri-axial reference of accelerations."""
+    if reference.channels != 3 or reference.quantity != "acceleration" or reference.unit_stated:
+        return []
+    return [
+        "the reference feels no gravity, and nobody stated its unit: it is taken as AC-coupled, and in m/s2; state the "
+        "unit after the names of its columns"
+    ]
+
+
+def measures_gravity(reference: ReferenceTable) -> bool:
+    """Whether a reference measures gravity, and so is DC-coupled: a tri-axial one of accelerations, unless its mean is
+    small and no means over some samples have a steady magnitude. One that seems to be in another unit counts as one
+    that does."""
+    if reference.channels != 3 or reference.quantity != "acceleration":
+        return False
+    if not reference.unit_stated and not _mean_length(reference)[1]:
+        return True
+    rows = _some_rows(reference)
+    if float(np.linalg.norm(rows.mean(axis=0))) >= NOT_FELT_MPS2:
+        return True
+    return any(length >= NOT_FELT_MPS2 and scatter < STEADY for length, scatter in _mean_lengths(rows))
+
+
+def _some_rows(reference: ReferenceTable) -> Array:
+    """Whole rows (n, C) of the reference, spread over its samples."""
+    x, step = reference.x, -(-len(reference.x) // ROWS)
+    some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
+    rows = np.concatenate(some)
+    return np.asarray(rows[np.isfinite(rows).all(axis=1)])
+
+
+def _mean_lengths(rows: Array) -> list[tuple[float, float]]:
+    """The median magnitude of means over more and more samples, and the distance of its quartiles over it."""
+    told = []
+    for size in (size for size in MEANS_OF if FEWEST * size <= len(rows) or size == 1):
+        means = rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1)
+        low, middle, high = np.quantile(np.linalg.norm(means, axis=1), (0.25, 0.5, 0.75)).tolist()
+        told.append((middle, (high - low) / max(middle, np.finfo(float).tiny)))
+    return told
+
+
 def _mean_length(reference: ReferenceTable) -> tuple[float, bool]:
     """The magnitude of the mean where it is steadiest, and whether it is a usual one over any number of samples.
 
     Means over more and more samples are tried: those of a few contain the motion, those of many how the reference was
     turned.
     """
-    x, step = reference.x, -(-len(reference.x) // ROWS)
-    some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
-    rows = np.concatenate(some)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    lengths, scatter = [], []
-    for size in (size for size in MEANS_OF if FEWEST * size <= len(rows) or size == 1):
-        means = rows[: len(rows) // size * size].reshape(-1, size, rows.shape[1]).mean(axis=1)
-        low, middle, high = np.quantile(np.linalg.norm(means, axis=1), (0.25, 0.5, 0.75)).tolist()
-        lengths.append(middle)
-        scatter.append((high - low) / max(middle, np.finfo(float).tiny))
+    rows = _some_rows(reference)
+    lengths, scatter = zip(*_mean_lengths(rows), strict=True)
     named = [k for k, length in enumerate(lengths) if _unit(length) and scatter[k] < STEADY]
     best = min(named or range(len(lengths)), key=lambda k: scatter[k])
     not_felt = float(np.linalg.norm(rows.mean(axis=0))) < NOT_FELT_MPS2

@@ -20,7 +20,7 @@ from agent.delivery.publication import Publisher
 from agent.delivery.store import Store
 from agent.recording.head import HEAD_NAME
 from agent.recording.signing import Signer
-from agent.recording.witness import KEY_NAME, PUBLIC_NAME, Witness, WitnessError
+from agent.recording.witness import KEY_NAME, PUBLIC_NAME, ChainWitness, WitnessError
 from tests.attacks.chain_site import KEY, known, public_pem, record
 from tests.attacks.signed_site import listed
 from tests.unit.zenoh_site import Site, wait_for
@@ -30,10 +30,10 @@ GATEWAY = "site/gateway"
 OWN = Ed25519PrivateKey.from_private_bytes(bytes(32))
 
 
-def witness(directory: Path, **options: object) -> Witness:
+def witness(directory: Path, **options: object) -> ChainWitness:
     directory.mkdir(exist_ok=True)
     (directory / PUBLIC_NAME).write_bytes(public_pem(OWN))
-    return Witness(directory, Signer(OWN), options.get("keys"), time.time_ns)  # type: ignore[arg-type]
+    return ChainWitness(directory, Signer(OWN), options.get("keys"), time.time_ns)  # type: ignore[arg-type]
 
 
 def audited(data: Path, kept: Path, tmp_path: Path) -> tuple[int, str]:
@@ -89,7 +89,7 @@ def test_a_line_of_the_witness_cannot_be_changed(site: tuple[Path, Path], tmp_pa
     text = audited(data, kept, tmp_path)[1]
     assert f"FAILED: {path}: line" in text
     with pytest.raises(WitnessError):
-        Witness(kept, Signer(KEY if change == "other key" else OWN), None, time.time_ns)
+        ChainWitness(kept, Signer(KEY if change == "other key" else OWN), None, time.time_ns)
 
 
 def test_two_histories_under_one_key_are_proven(tmp_path: Path) -> None:

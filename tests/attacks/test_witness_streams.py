@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from agent.recording.head import Head
 from agent.recording.signing import SignedStatement, Signer
-from agent.recording.witness import DAY_NS, GATEWAYS_MAX, PROOFS_MAX, HeadFile, Witness
+from agent.recording.witness import DAY_NS, GATEWAYS_MAX, PROOFS_MAX, ChainWitness, HeadFile
 from tests.attacks.chain_site import KEY, known
 
 OWN = Ed25519PrivateKey.from_private_bytes(bytes(32))  # the witness's
@@ -46,7 +46,7 @@ class Machine:
         self.start()
 
     def start(self) -> None:
-        self.witness = Witness(self.directory, Signer(OWN), self.keys, lambda: self.now_ns)
+        self.witness = ChainWitness(self.directory, Signer(OWN), self.keys, lambda: self.now_ns)
 
     def take(self, data: bytes, gateway: str = GATEWAY, after_s: float = 0.0) -> tuple[bool, str]:
         self.now_ns += int(after_s * SECOND_NS)

@@ -173,7 +173,7 @@ def test_a_dead_reference_is_refused(
     assert status == 3
     (reason,) = found["reasons"]
     assert reason.startswith(
-        "none of the 4 windows can be used; the first of them (theta 35 deg, alpha 0 deg): the reference is silent"
+        "none of the 4 windows can be used; the longest of them (theta 35 deg, alpha 0 deg): the reference is silent"
     )
     assert all("silent" in w["reason"] for w in found["windows"])
 

@@ -104,3 +104,15 @@ def test_the_decision_rule_takes_u_into_account(tmp_path: Path) -> None:
         told = content([tmp_path / "result.json"], path)
         found[rule] = [entry["conforms"] for entry in told["conformity"]]
     assert found == {"simple acceptance": [True, True, True], "guard band": [False, True, True]}
+
+
+def test_gravity_alone_names_no_instrument_as_the_reference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rest = {"start_s": 0.0, "stop_s": 30.0, "used": True, "reason": "", "points": 3000, "kind": "rest"}
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(fields(reference_quantity=None, windows=[rest])))
+    status, said = run(capsys, path, "--stated", stated(tmp_path), "-o", tmp_path / "out")
+    assert status == 2
+    assert "reference.name: is missing; gravity was the only excitation" in said
+    told = tmp_path / "certificate.toml"
+    told.write_text(told.read_text().replace("[reference]", '[reference]\nname = "local gravity"'))
+    assert content([path], told)["stated"]["reference"]["name"] == "local gravity"

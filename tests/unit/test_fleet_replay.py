@@ -25,7 +25,7 @@ from agent.core.pipeline import Pipeline
 from agent.fleet.results import Summary, results_of
 from agent.fleet.settings import ChangedSetting, SettingError
 from agent.fleet.sources import SourceError, local, recordings_in
-from agent.fleet.task import Task, run_task
+from agent.fleet.task import RecordingTask, run_task
 from agent.fleet.workers import LocalWorkers, outcome
 from agent.recording.reading import RecordingReader
 from tests.unit.recorded_bench import record
@@ -56,7 +56,7 @@ class Here(LocalWorkers):
     def __init__(self) -> None:
         pass
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, bytes | str]]:
+    def run(self, tasks: Iterable[RecordingTask]) -> Iterator[tuple[RecordingTask, bytes | str]]:
         return ((task, outcome(partial(run_task, task))) for task in tasks)
 
 
@@ -173,7 +173,7 @@ def test_a_changed_file_another_setting_and_a_spoilt_result_are_computed_again(
     assert (unchanged(), unchanged()) == (False, True)
 
 
-def run_or_end(task: Task) -> bytes:
+def run_or_end(task: RecordingTask) -> bytes:
     if "deadly" in task.place:
         os.kill(os.getpid(), signal.SIGKILL)
     return run_task(task)
@@ -305,7 +305,7 @@ def test_recordings_in_an_object_store(recordings: Path, tmp_path: Path, monkeyp
     (tmp_path / "out").mkdir()
     told = list(results_of(recordings_in(["s3://fleet/"]), (), Here(), tmp_path / "out", audit=False))
     assert [summary.place for summary in told] == ["s3://fleet/site/damaged.mcap", "s3://fleet/site/gateway-1.mcap"]
-    local_one = json.loads(run_task(Task(place=str(recordings / "gateway-1.mcap"))))
+    local_one = json.loads(run_task(RecordingTask(place=str(recordings / "gateway-1.mcap"))))
     stored_one = json.loads(next((tmp_path / "out").glob("gateway-1*")).read_bytes())
     differing = {name for name in stored_one if stored_one[name] != local_one[name]}
     assert differing <= {"place", "replayed"}

@@ -15,7 +15,7 @@ from calib.recorded.measurement_result import NuisanceValue
 from calib.recorded.notebook import calibrate
 from calib.recorded.outcome import Outcome
 from calib.recorded.table import ReferenceTable
-from calib.recorded.wrong_unit import check_gravity, gravity_warnings
+from calib.recorded.wrong_unit import check_gravity, gravity_warnings, measures_gravity
 from tests.clamp_windows import frame
 
 Table = tuple[np.ndarray, np.ndarray]  # times in s and values
@@ -162,6 +162,39 @@ def test_strong_motion_and_turning_are_no_other_unit(rms_mps2: float, hz: float)
     )
     not_felt = np.column_stack([shaken, shaken, shaken])
     check_gravity(ReferenceTable("reference", t, not_felt, "acceleration", "ax"))
+
+
+def test_a_reference_that_does_not_feel_gravity_tells_no_offset() -> None:
+    """A seismometer, an IEPE one with three axes, or a file whose means were taken out: the sensor's mean contains
+    gravity, which would be taken for Q."""
+    sensor, (t, a) = triad(seconds=20.0)
+    lines = np.fft.rfft(a, axis=0)
+    lines[np.fft.rfftfreq(len(t), 1.0 / RATE_HZ) < 0.4] = 0.0  # means and leans
+    moved = np.fft.irfft(lines, len(t), axis=0)
+    found = beside(sensor, (t, moved))
+    assert found.status == "valid"
+    assert np.isnan(found.offset).all()
+    assert np.isfinite(found.sensitivity).all()
+    stated = beside(sensor, (t, moved), reference_coupling="dc")
+    assert np.isfinite(stated.offset).all()
+
+
+def test_which_references_feel_gravity() -> None:
+    t = np.arange(12_000) / RATE_HZ
+    shaken = 4.0 * np.sin(2.0 * np.pi * 3.0 * t)[:, None] * np.ones(3)
+    turned = G_MPS2 * np.column_stack([np.sin(0.9 * t), np.cos(0.9 * t), 0.0 * t])
+    feels = {
+        "shaken and turned": (shaken + turned, True),
+        "shaken": (shaken, False),
+        "one axis": (turned[:, :1], False),
+    }
+    for told, (x, expected) in feels.items():
+        assert measures_gravity(ReferenceTable("reference", t, x, "acceleration", "ax")) is expected, told
+    assert not measures_gravity(ReferenceTable("reference", t, turned, "velocity", "vx"))
+    # 1 in the unit g, which nobody stated, is refused as such (check_gravity); stated m/s2 is an offset of 0.09 g.
+    in_g = np.tile([0.0, 0.0, 0.9], (1000, 1))
+    assert measures_gravity(ReferenceTable("reference", t[:1000], in_g, "acceleration", "ax"))
+    assert not measures_gravity(ReferenceTable("reference", t[:1000], in_g, "acceleration", "ax", unit_stated=True))
 
 
 def test_a_stated_unit_is_believed_and_the_size_told() -> None:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from agent.acquisition.reader import BLOCKS_A_SECOND, QUEUE_S, EventQueue, Reader
+from agent.acquisition.reader import BLOCKS_A_SECOND, QUEUE_S, DeviceReader, EventQueue
 from agent.core.events import DeviceChange, Event
 from hw.block import BlockFlags, DeviceInfo, Drop, SampleBlock
 from hw.sensor import DeviceLost, Options, boot_id, system_clock
@@ -101,7 +101,7 @@ def attempts(sensor: Any, losses: int) -> list[int]:
         seen.extend(e for e in drained(events) if isinstance(e, DeviceChange) and e.state == "lost")
         return len(seen) >= losses
 
-    reader = Reader("imu", sensor, events)
+    reader = DeviceReader("imu", sensor, events)
     reader.start()
     wait_until(lost, 60, "losses")
     reader.stop()

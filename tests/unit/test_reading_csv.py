@@ -210,7 +210,11 @@ def test_faults(text: str | bytes, message: str, tmp_path: Path) -> None:
     ("header", "options", "message"),
     [
         ("t,ch1", {}, "neither name nor unit tells what 'ch1' is, add its unit .*--reference-columns"),
-        ("t,PCB (mV)", {}, "column 'PCB \\(mV\\)' is in mV, so --sensitivity is needed, for example .*100 mV/g"),
+        (
+            "t,PCB (mV)",
+            {},
+            "column 'PCB \\(mV\\)' is in mV, and its sensitivity is not stated; state it .* --sensitivity .100 mV/g",
+        ),
         ("t,acc (g)", {"sensitivity": "100 mV/g"}, "is in g already; remove --sensitivity"),
         ("t,PCB (counts)", {"sensitivity": "100 mV/g"}, "--sensitivity is not for counts"),
         ("t,a", {"columns": "time=t,x=b"}, "there is no column 'b' in the header 't,a'"),

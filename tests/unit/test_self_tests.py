@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agent.acquisition.reader import EventQueue, Reader
+from agent.acquisition.reader import DeviceReader, EventQueue
 from agent.acquisition.self_testing import PAIRS, SelfTesting
 from agent.config import Config
 from agent.config.channel import SelfTestPlan
@@ -71,7 +71,7 @@ class Bus(EventQueue):
         """The events of a reader until a condition holds; its clock of UTC goes `fast` times as fast."""
         plan = SelfTestPlan.model_validate({"at": "03:00"})
         testing = SelfTesting(plan, lambda: START + timedelta(seconds=fast * self.t_s))
-        reader = Reader("s", sensor, self, testing)
+        reader = DeviceReader("s", sensor, self, testing)
 
         def seen() -> object:
             while (event := self.get(0.0)) is not None:
