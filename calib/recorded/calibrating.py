@@ -23,7 +23,13 @@ from calib.recorded.poses import PoseInterval, Poses, PoseSettings, beside_refer
 from calib.recorded.priors import contradictions, instrument_of, priors_of
 from calib.recorded.table import ReferenceTable, SensorTable, ends_s
 from calib.recorded.tables import Making, Tables
-from calib.recorded.wrong_unit import check_gravity, gravity_warnings, measures_gravity, unconfirmed_unit
+from calib.recorded.wrong_unit import (
+    check_gravity,
+    gravity_warnings,
+    may_feel_gravity,
+    measures_gravity,
+    unconfirmed_unit,
+)
 from calib.signal.instrument import Instrument
 
 CORNERS_ALIKE = (
@@ -41,14 +47,14 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
     silent, feels = [], False
     if reference is not None and reference.channels == 3 and options.rotation is not None:
         silent = silent_channels(sensor, reference, options.rotation)
-        feels = _setting(options, reference).reference_coupling == "dc"
+        feels = options.reference_coupling != "ac"  # its dead channel may be the one along gravity
     if outcome.reasons or (silent and feels):  # what a dead channel does not feel of gravity would be taken for Q
         found = causes(sensor, reference, poses, outcome)
         return replace(outcome, calibration=None, reasons=(*found, *silent, *outcome.reasons))
     told = [*outcome.warnings, *axis_warnings(outcome.sensitivity), *silent]
-    if reference is not None and options.method == 3 and _coupled(options, reference).corners_alike:
+    if reference is not None and options.method == 3 and _coupled(options, sensor, reference).corners_alike:
         told.append(CORNERS_ALIKE)
-    if reference is not None and _setting(options, reference).reference_coupling == "dc":
+    if reference is not None and _setting(options, sensor, reference).reference_coupling == "dc":
         told += gravity_warnings(reference)
     elif reference is not None and options.reference_coupling is None:
         told += unconfirmed_unit(reference)
@@ -85,8 +91,8 @@ def tables_of(
     if reference is not None:
         instrument = replace(instrument, quantity=reference.quantity)
         _check_quantity(reference, options.reference_quantity)
-    setting = _setting(options, reference)
-    instrument = _coupled(options, reference, instrument)
+    setting = _setting(options, sensor, reference)
+    instrument = _coupled(options, sensor, reference, instrument)
     if reference is not None and setting.reference_coupling == "dc":
         check_gravity(reference)
     intervals = _intervals(poses, setting, reference)
@@ -96,11 +102,13 @@ def tables_of(
     return Tables(sensor, reference, intervals, instrument, Making(settings, align=more))
 
 
-def _coupled(options: Options, reference: ReferenceTable | None, instrument: Instrument | None = None) -> Instrument:
+def _coupled(
+    options: Options, sensor: SensorTable, reference: ReferenceTable | None, instrument: Instrument | None = None
+) -> Instrument:
     """The instrument, by default that of the options, with the couplings of reference and sensor."""
-    setting = _setting(options, reference)
-    coupled = {"ac_coupled": setting.reference_coupling == "ac", "sensor_ac_coupled": setting.coupling == "ac"}
-    return replace(instrument or instrument_of(options), **coupled)
+    setting = _setting(options, sensor, reference)
+    ac, sensor_ac = (coupling == "ac" for coupling in (setting.reference_coupling, setting.coupling))
+    return replace(instrument or instrument_of(options), ac_coupled=ac, sensor_ac_coupled=sensor_ac)
 
 
 def _check_quantity(reference: ReferenceTable, stated: str | None) -> None:
@@ -111,21 +119,24 @@ def _check_quantity(reference: ReferenceTable, stated: str | None) -> None:
         )  # fmt: skip
 
 
-def _setting(options: Options, reference: ReferenceTable | None) -> PoseSettings:
+def _setting(options: Options, sensor: SensorTable, reference: ReferenceTable | None) -> PoseSettings:
     """The settings that apply to every pose."""
     channels = 0 if reference is None else reference.channels
     return PoseSettings(
         gravity_mps2=options.gravity or STANDARD_GRAVITY_MPS2,
         static_sign=options.static_sign,
         coupling=options.coupling,
-        reference_coupling=options.reference_coupling or _usual_coupling(reference),
+        reference_coupling=options.reference_coupling or _usual_coupling(sensor, reference),
         reference_channels=channels,
         rotation=options.rotation,
     )
 
 
-def _usual_coupling(reference: ReferenceTable | None) -> Coupling:
-    return "dc" if reference is not None and measures_gravity(reference) else "ac"
+def _usual_coupling(sensor: SensorTable, reference: ReferenceTable | None) -> Coupling:
+    """That of a reference for which nobody states one: DC where it shows gravity, or neither it nor the sensor does."""
+    if reference is None or reference.channels != 3 or reference.quantity != "acceleration":
+        return "ac"
+    return "dc" if measures_gravity(reference) or not may_feel_gravity(sensor, reference) else "ac"
 
 
 def _intervals(poses: Poses | None, setting: PoseSettings, reference: ReferenceTable | None) -> list[PoseInterval]:

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from calib.geometry import STANDARD_GRAVITY_MPS2
-from calib.model import Array
+from calib.model import Array, Slices
 from calib.recorded.errors import UnitError
-from calib.recorded.table import ReferenceTable
+from calib.recorded.table import ReferenceTable, SensorTable
 
 # How large gravity is in units that are taken for m/s2.
 GRAVITY_IN = {"g": 1.0, "mg": 1000.0, "cm/s2": 100 * STANDARD_GRAVITY_MPS2, "mm/s2": 1000 * STANDARD_GRAVITY_MPS2}
@@ -80,17 +80,25 @@ def measures_gravity(reference: ReferenceTable) -> bool:
         return False
     if not reference.unit_stated and not _mean_length(reference)[1]:
         return True
-    rows = _some_rows(reference)
+    rows = _some_rows(reference.x)
     if float(np.linalg.norm(rows.mean(axis=0))) >= NOT_FELT_MPS2:
         return True
     return any(length >= NOT_FELT_MPS2 and scatter < STEADY for length, scatter in _mean_lengths(rows))
 
 
-def _some_rows(reference: ReferenceTable) -> Array:
-    """Whole rows (n, C) of the reference, spread over its samples."""
-    x, step = reference.x, -(-len(reference.x) // ROWS)
-    some = [x[first : first + ROWS_AT_ONCE * step : step] for first in range(0, len(x), ROWS_AT_ONCE * step)]
-    rows = np.concatenate(some)
+def may_feel_gravity(sensor: SensorTable, reference: ReferenceTable) -> bool:
+    """Whether the sensor's mean may be gravity: it is large, where outputs and reference are compared by how they move.
+    An offset of half the supply is as large."""
+    V, x = _some_rows(sensor.v), _some_rows(reference.x)
+    moved = float(np.sqrt(np.var(V, axis=0).sum()))
+    return float(np.linalg.norm(V.mean(axis=0)) * np.sqrt(np.var(x, axis=0).sum())) >= NOT_FELT_MPS2 * moved
+
+
+def _some_rows(samples: Slices) -> Array:
+    """Whole rows (n, C) of a table's samples, spread over it."""
+    step = -(-len(samples) // ROWS)
+    firsts = range(0, len(samples), ROWS_AT_ONCE * step)
+    rows = np.concatenate([samples[first : first + ROWS_AT_ONCE * step : step] for first in firsts])
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
@@ -110,7 +118,7 @@ def _mean_length(reference: ReferenceTable) -> tuple[float, bool]:
     Means over more and more samples are tried: those of a few contain the motion, those of many how the reference was
     turned.
     """
-    rows = _some_rows(reference)
+    rows = _some_rows(reference.x)
     lengths, scatter = zip(*_mean_lengths(rows), strict=True)
     named = [k for k, length in enumerate(lengths) if _unit(length) and scatter[k] < STEADY]
     best = min(named or range(len(lengths)), key=lambda k: scatter[k])

@@ -111,8 +111,8 @@ def test_holes_are_no_noise(run: int, every: int) -> None:
 
 @pytest.mark.parametrize("order", range(len(FILTER_BANDS)))
 def test_noise_that_was_differentiated_is_mostly_in_the_filters_edge(order: int) -> None:
-    """White noise, differentiated so often, and limited: its power is that up to the equivalent bandwidth, to 1.5 %, for
-    bands from 1/40 to 1/6 of the rate. The bandwidth for white noise alone takes 4 % off after two, 8 % after three."""
+    """White noise, differentiated so often, and limited: its power is that up to the equivalent bandwidth, to 1.5 %,
+    for bands from 1/40 to 1/6 of the rate. The bandwidth for white noise alone takes 4 % off after two."""
     for band_hz in (5.0, 10.0, 33.0):
         pulse = np.zeros((20_001, 1))
         pulse[len(pulse) // 2] = 1.0

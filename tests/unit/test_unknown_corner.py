@@ -1,4 +1,4 @@
-"""An AC-coupled instrument whose corner nobody states, near the motion: an IEPE accelerometer beside a slow structure."""
+"""An AC-coupled instrument whose corner nobody states, near the motion: an IEPE accelerometer on a slow structure."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def beside(seed: int, of_reference: Filter, of_sensor: Filter, *ac: str, **state
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("times", [2.0, pytest.param(4.0, marks=pytest.mark.thorough)])
 def test_what_the_corner_of_a_reference_does_is_not_the_sensors(times: float, order: int) -> None:
-    """The corner is at a half or a quarter of the motion's lower end, so that the reference shows up to 1.9 % too little
-    at the frequency of S. 4 recordings."""
+    """The corner is at a half or a quarter of the motion's lower end, so that the reference shows up to 1.9 % too
+    little at the frequency of S. 4 recordings."""
     largest = []
     for seed in range(4):
         told, S = beside(seed, highpass(BAND_HZ[0] / times, order), flat, "reference")
@@ -73,3 +73,20 @@ def test_two_corners_that_nothing_tells_apart_are_a_warning() -> None:
     corners = {"reference_corner_hz": 0.15, "sensor_corner_hz": 0.15}
     told, _ = beside(2, corner, corner, "sensor", "reference", **corners)
     assert CORNERS_ALIKE not in told.warnings
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("feels", [False, True])
+def test_a_reference_without_gravity_responds_to_constants_where_the_sensor_shows_none(feels: bool) -> None:
+    """Nobody states the coupling. Beside a sensor that shows gravity, Q would contain it; else Q is determined."""
+    random = np.random.default_rng(95)
+    a = np.cumsum(random.standard_normal((6000, 3)), axis=0) * 0.02
+    a -= a.mean(axis=0)
+    V = a + [0.1, -0.2, 0.1 + G_MPS2 * feels] + 0.002 * random.standard_normal(a.shape)
+    at_s = np.arange(len(a)) / RATE_HZ
+    told = calibrate(
+        (at_s, V), {"time_s": at_s} | {f"a{axis}": a[:, k] for k, axis in enumerate("xyz")}, rotation=ALONG
+    )
+    assert told.status == "valid", told.reasons
+    assert list(np.isfinite(told.offset)) == [not feels] * 3
+    assert feels or np.abs(told.offset - [0.1, -0.2, 0.1]).max() < 0.02
