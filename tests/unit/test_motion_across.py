@@ -83,7 +83,7 @@ def test_a_windows_bands_are_those_along_its_motion() -> None:
     assert data.bands.between.relative_u < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("across", [0.0, 0.3])
 def test_calibrate_counts_the_motion_across_that_the_sensor_shows(across: float) -> None:
     """With the default of 1 %: S of a sensor along z, of which the outputs x and y show motion across. What it tells of
@@ -108,6 +108,7 @@ def beside_one_axis(u: Array, V: Array) -> Any:
     return calibrate((time_s, V), {"time_s": time_s, "a": u[:, 0]}, poses=poses, reference_coupling="dc")
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize("across", [0.5, 1.5])
 def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(across: float) -> None:
     """What it moves across follows what it moves along differently in each octave, by its modes. S is off by 3 % in

@@ -164,7 +164,7 @@ def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better(window
     assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 2 * 1.1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_nor_by_motion_askew_to_its_channels() -> None:
     """Which way it goes was measured by two channels, each with its own error: their ratio is no third standard."""
     random, found = np.random.default_rng(12), mounted(FIXED.with_values({"reference": 1e-3}))
