@@ -229,7 +229,7 @@ def test_ctrl_c_ends_the_command_in_order(site: Site, tmp_path: Path) -> None:
     assert (tmp_path / "known").read_text().count("gateway simulated/gw") == 5
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_tells_that_a_process_has_ended(site: Site, tmp_path: Path) -> None:
     process = fleet_command(site, tmp_path)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
