@@ -10,7 +10,6 @@ import pytest
 from benchmarks.online.agreement import LIMIT_U, Both, bench_day, building
 
 
-@pytest.mark.one_case
 @pytest.mark.parametrize("recording", [bench_day, building])
 @pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.thorough)])
 def test_files_and_agent_agree(recording: Callable[[int], Both], seed: int) -> None:

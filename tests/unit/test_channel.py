@@ -208,7 +208,7 @@ def test_a_new_prior_that_the_calibration_in_force_contradicts_is_an_operators_w
     assert reason.startswith("begun again from the prior: the calibration in force contradicts the changed prior: ")
 
 
-@pytest.mark.one_case
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "status", "reason"),
     [
