@@ -108,7 +108,6 @@ def beside_one_axis(u: Array, V: Array) -> Any:
     return calibrate((time_s, V), {"time_s": time_s, "a": u[:, 0]}, poses=poses, reference_coupling="dc")
 
 
-@pytest.mark.one_case
 @pytest.mark.parametrize("across", [0.5, 1.5])
 def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(across: float) -> None:
     """What it moves across follows what it moves along differently in each octave, by its modes. S is off by 3 % in
