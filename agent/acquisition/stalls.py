@@ -14,11 +14,14 @@ def few_objects() -> Iterator[None]:
     """Within this context, the garbage collector ignores the objects that existed before.
 
     The collector examines all objects without a pause each time a quarter of them is new. The 60,000 objects of the
-    loaded modules take 10 to 30 ms; the objects that a run makes take 0.2 ms.
+    loaded modules take 10 to 30 ms; the objects that a run makes take 0.2 ms. Who has frozen objects before decides
+    when the collector sees them again.
     """
+    frozen_before = gc.get_freeze_count() > 0
     gc.collect()
     gc.freeze()
     try:
         yield
     finally:
-        gc.unfreeze()
+        if not frozen_before:
+            gc.unfreeze()

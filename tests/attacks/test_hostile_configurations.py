@@ -34,6 +34,7 @@ def test_faults_without_number_are_told_in_bounded_time(tmp_path: Path, name: st
     assert len(told.value.faults) <= 101
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "text",
     [

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FILES = 45
+FILES = 25
 
 
 @pytest.mark.slow

@@ -168,6 +168,7 @@ def test_a_pose_that_lasts_for_ever_takes_no_time(start_s: float, stop_s: float)
     assert 300 < window.points <= 400
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "text",
     [

@@ -327,7 +327,7 @@ def read(data: bytes, product: bytes) -> list[tuple[float, ...]]:
     return rows
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("kind", ["cut", "lost", "added", "flipped"])
 @pytest.mark.parametrize("product", [b"A352AD10", b"A342VD10"])
 def test_the_way_is_found_within_two_frames(product: bytes, kind: str) -> None:

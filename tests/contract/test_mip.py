@@ -316,7 +316,7 @@ def read(data: bytes, piece: int = 61) -> list[tuple[float, ...]]:
     return rows
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("kind", ["cut", "lost", "added", "flipped"])
 def test_the_way_is_found_within_two_packets(kind: str) -> None:
     """Every byte of a packet damaged. The search holds packets back as long as a wrong length asks for more bytes."""

@@ -194,7 +194,7 @@ HAPPENINGS = st.one_of(
 
 @pytest.mark.slow
 @settings(
-    max_examples=25,
+    max_examples=12,
     deadline=None,
     derandomize=True,
     phases=[Phase.generate],

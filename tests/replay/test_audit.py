@@ -194,6 +194,7 @@ print("gone on")
 """
 
 
+@pytest.mark.one_case
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names kernels of x86")
 @pytest.mark.parametrize("command", ["replay", "audit"])
 def test_a_program_that_runs_a_command_is_not_begun_anew(command: str, tmp_path: Path) -> None:

@@ -140,11 +140,18 @@ FORGERIES: dict[str, Forge] = {
 }
 
 
-@pytest.mark.parametrize("engine", [UNKNOWN, RELEASE, ""])
-def test_no_forgery_passes_under_the_name_of_another_engine(engine: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("engine", "forgeries"),
+    [
+        (RELEASE, list(FORGERIES)),
+        *((engine, list(FORGERIES)[:4]) for engine in (UNKNOWN, "")),
+        *(pytest.param(engine, list(FORGERIES)[4:], marks=pytest.mark.thorough) for engine in (UNKNOWN, "")),
+    ],
+)
+def test_no_forgery_passes_under_the_name_of_another_engine(engine: str, forgeries: list[str], tmp_path: Path) -> None:
     passed = []
-    for number, (name, forge) in enumerate(FORGERIES.items()):
-        path = forged(tmp_path / str(number), engine, forge)
+    for number, name in enumerate(forgeries):
+        path = forged(tmp_path / str(number), engine, FORGERIES[name])
         status, said = audited(path)
         assert status == 4, (name, said)
         passed += [name] if said["ok"] else []

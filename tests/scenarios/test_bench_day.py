@@ -106,6 +106,7 @@ def test_motion_with_a_period_of_five_seconds_is_taken_in_every_position() -> No
     assert all(r.stop_s - r.start_s > 15.0 for r in used)
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize("positions", ["stops", "free"])
 def test_its_recording_replays_bit_for_bit(positions: str, tmp_path: Path) -> None:
     world = bench.world(SEED)

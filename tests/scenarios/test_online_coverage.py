@@ -74,7 +74,7 @@ def first_window(seed: int) -> Array | None:
     return np.asarray(np.diag((np.array(update.sensitivity) - truth) / u)[known])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("lives", "least", "most"), [(40, 0.80, 1.12), pytest.param(80, 0.83, 1.08, marks=pytest.mark.thorough)]
 )

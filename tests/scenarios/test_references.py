@@ -74,6 +74,7 @@ POSES = {
 }
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("reference", "channel"),
     [

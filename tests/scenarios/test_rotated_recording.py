@@ -73,6 +73,7 @@ def test_the_chain_and_each_file_alone_replay_bit_for_bit(data_dir: Path) -> Non
     assert len(whole["windows"]) == len(results(data_dir, "window")) >= 3
 
 
+@pytest.mark.thorough
 def test_replay_gives_the_same_on_one_core(data_dir: Path) -> None:
     files = recordings(data_dir)
     script = "import os, sys; os.sched_setaffinity(0, {0}); from agent.__main__ import main; main()"

@@ -10,7 +10,8 @@ import threading
 from pathlib import Path
 
 from agent.acquisition.service import Service
-from agent.config import parse_config
+from agent.acquisition.stalls import few_objects
+from agent.config import Config, parse_config
 from agent.terminal.watch import RunView
 from tests.scenarios.processes import ROOT, wait_until
 from tests.unit.recorded_bench import record
@@ -68,6 +69,13 @@ def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> N
         "test",
     )
     gc.unfreeze()  # what tests/conftest.py froze
+    try:
+        _run_and_look(config, tmp_path)
+    finally:
+        gc.freeze()
+
+
+def _run_and_look(config: Config, tmp_path: Path) -> None:
     assert len(gc.get_objects()) > 4 * FEW
     with RunView(config, "test", None) as watch:
         service = Service(config, tmp_path / "data", watch)
@@ -82,3 +90,10 @@ def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> N
             runner.join(10)
     assert not runner.is_alive()
     assert len(gc.get_objects()) > 4 * FEW
+
+
+def test_what_was_frozen_before_stays_so() -> None:
+    assert gc.get_freeze_count() > 4 * FEW
+    with few_objects():
+        pass
+    assert gc.get_freeze_count() > 4 * FEW

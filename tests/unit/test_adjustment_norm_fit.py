@@ -29,8 +29,8 @@ def _rests(
     ]  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("walk_mps2", [0.0, 0.003, 0.02])
+@pytest.mark.one_case
+@pytest.mark.parametrize("walk_mps2", [0.003, 0.0, 0.02])
 def test_u_covers_with_and_without_a_drift_of_q(walk_mps2: float) -> None:
     """Twenty rests, 200 times; Q walks by `walk_mps2` over them. U(Q) covers Q in the middle and at the end."""
     random = np.random.default_rng(70)

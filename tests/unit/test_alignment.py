@@ -139,7 +139,7 @@ APART = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("reference", ["dc", pytest.param("ac", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize(
     ("minutes", "to_hz", "ppm", "lag_s"),

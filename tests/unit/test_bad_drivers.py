@@ -209,7 +209,7 @@ def test_ten_faults_in_a_row_name_the_driver_and_what_to_do(
 HANGS = ["open", "read_block", "close"]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("method", HANGS)
 def test_a_driver_that_does_not_return_is_named_and_the_agent_ends_in_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str

@@ -59,7 +59,7 @@ def test_an_option_replaces_what_the_file_states(
     assert "Bridge Operator" not in text
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_file_of_the_statements_is_not_written_over(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, result: Path
 ) -> None:

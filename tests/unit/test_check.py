@@ -104,7 +104,7 @@ BINARY = (
 FAST = 'driver = "adxl355"\noptions = { bus = 250, rate_hz = 1000 }\n'
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("device", "advice"),
     [

@@ -24,7 +24,7 @@ def _ended(*command: str) -> tuple[int, bytes]:
     return ended.returncode, ended.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("command", ["sensors", "--help", "run --help"])
 def test_a_reader_that_has_ended_is_no_fault(command: str) -> None:
     assert _ended(*command.split()) == (1, b"")

@@ -69,7 +69,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert not (tmp_path / "b.csv").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_same_s_and_q(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A whole calibration from files as other programs write them."""
     write_files(Bench(plain(7), seed=7), tmp_path, None, {})

@@ -150,7 +150,7 @@ def _without_first(block: SampleBlock, n: int, flags: BlockFlags) -> SampleBlock
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("positions", [False, True])
 def test_sample_numbers_that_jump_at_will_cost_their_windows_and_the_agent_goes_on(positions: bool) -> None:
     """Numbers 0, 1, 0, 1, ... make no clock."""

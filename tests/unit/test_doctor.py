@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ from agent.setup import device_checks, machine_checks
 from agent.setup.contradictions import contradictions
 from agent.setup.finding import Finding
 from hw.adxl355 import Adxl355Options
-from hw.virtual.serial_port import PtyDevice, SampleLines
+from hw.block import DeviceInfo, Drop, SampleBlock
+from hw.sensor import boot_id
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 KEPT = 512 * 1024 * 1024  # bytes, default of recording.least_free_bytes
@@ -167,20 +169,44 @@ def test_a_router_that_answers_and_one_that_does_not() -> None:
     assert told(machine_checks.router_findings(config), "router")[0][0] == "advice"
 
 
-@pytest.mark.parametrize(("rate_hz", "verdict"), [(200.0, "good"), (150.0, "fault")])
-def test_the_rate_that_a_device_delivers(rate_hz: float, verdict: str) -> None:
-    began_s = time.monotonic()
-    lines = SampleLines(lambda _, n: np.tile([1.0, 2.0, 9.8], (n, 1)), lambda now_s: int((now_s - began_s) * rate_hz))
-    device = PtyDevice(lines)
-    device.start()
-    try:
-        config = parse_config(gateway(device.path), "test")
-        options = device_checks.loaded_options(config)
-        (found,) = told(device_checks.measured_findings(config, options, 2.5), "throughput")
-    finally:
-        device.stop()
-    assert found[0] == verdict, found
-    assert "nominal 200" in found[1]
+class Metered:
+    """A sensor whose reads take no time: each makes a clock go on by half a second. So no other program delays it."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self.now_ns, self._utc_ns = time.monotonic_ns() - 60 * 10**9, time.time_ns() - time.monotonic_ns()
+        self._n, self._next = round(rate_hz / 2), 0
+
+    def clock(self) -> tuple[int, int]:
+        return self.now_ns, self.now_ns + self._utc_ns
+
+    def open(self) -> DeviceInfo:
+        return DeviceInfo("serial-csv", "lines", "", "m/s2", 3, 200.0)
+
+    def read_block(self) -> SampleBlock:
+        self.now_ns += 500_000_000
+        first, self._next = self._next, self._next + self._n
+        arrival_ns, counts = np.array([self.now_ns]), np.array([self._n], dtype=np.int32)
+        utc_ns, values = self.clock()[1], np.tile([1.0, 2.0, 9.8], (self._n, 1))
+        return SampleBlock("mems", boot_id(), utc_ns, first, 200.0, arrival_ns, counts, values)
+
+    def take_drops(self) -> list[Drop]:
+        return []
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(("rate_hz", "verdict"), [(200.0, "good"), (204.0, "good"), (206.0, "fault"), (150.0, "fault")])
+def test_the_rate_that_a_device_delivers(rate_hz: float, verdict: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = Metered(rate_hz)
+    config = parse_config(gateway("/dev/none"), "test")
+    options = device_checks.loaded_options(config)
+    monkeypatch.setattr(device_checks, "load_driver", lambda _: lambda *_: sensor)
+    monkeypatch.setattr(device_checks, "system_clock", sensor.clock)
+    in_its_time = SimpleNamespace(monotonic=lambda: sensor.now_ns * 1e-9, process_time=lambda: 0.0)
+    monkeypatch.setattr(device_checks, "time", in_its_time)
+    findings = device_checks.measured_findings(config, options, 2.5)
+    assert told(findings, "throughput") == [(verdict, f"mems: {rate_hz:g} samples a second, nominal 200")]
 
 
 def test_the_rates_that_a_running_agent_has_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

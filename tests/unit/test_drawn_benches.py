@@ -91,7 +91,7 @@ def beyond(seed: int) -> float | None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [*range(1, 5), *(pytest.param(k, marks=pytest.mark.thorough) for k in (0, 5, 6, 7))])
+@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(k, marks=pytest.mark.thorough) for k in (0, 3, 4, 5, 6, 7))])
 def test_a_drawn_bench_is_within_4_u(seed: int) -> None:
     largest = beyond(seed)
     assert largest is not None

@@ -98,7 +98,7 @@ def test_s_is_right_beside_the_filters_of_an_adxl355_and_held_where_nobody_state
     assert without.used < chip.TIMING.windows
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("cut", [1, 2, 60])  # between the openings of the devices, after them, within a window
 def test_a_restored_state_goes_on_bit_for_bit(cut: int) -> None:
     assert_goes_on(drawn().config, list(events(STATED)), cut)

@@ -108,7 +108,7 @@ def test_a_date_stated_later_is_the_same_reference_and_another_date_is_a_new_cal
 @pytest.mark.slow
 def test_a_calibration_put_back_does_not_count_the_error_of_the_reference_again() -> None:
     found = lived(12)
-    for turn in range(8):
+    for turn in range(4):
         found.put(lived(3).result())
         for k in range(4):
             window = building_window(np.random.default_rng(k), level_mps2=(0.1, 0.1, 0.1))

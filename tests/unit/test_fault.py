@@ -23,7 +23,7 @@ from tests.unit.mounted_site import Site, begun, said, site_config, updates, win
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("device", ["s", "r"])
 @pytest.mark.parametrize("factor", [1e200, np.inf, 1e13])
 @pytest.mark.filterwarnings("ignore:invalid value encountered in multiply")  # 0 times inf, in the test
@@ -65,7 +65,7 @@ def break_the_results(patch: pytest.MonkeyPatch) -> str:
     return "agent/core/channel.py"
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("breaking", [break_the_windows, break_the_judge, break_the_results])
 def test_a_fault_of_the_program_is_told_with_its_place_and_the_agent_goes_on(
     breaking: Callable[[pytest.MonkeyPatch], str], monkeypatch: pytest.MonkeyPatch

@@ -36,7 +36,7 @@ def written(directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in directory.iterdir()}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_files_are_those_of_export_with_one_and_two_processes_and_go_on_where_they_ended(
     recordings: Path, tmp_path: Path
 ) -> None:

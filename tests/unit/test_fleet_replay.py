@@ -289,7 +289,7 @@ def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     running.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("bucket")
 def test_recordings_in_an_object_store(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import s3fs

@@ -62,11 +62,30 @@ def situations(directory: Path) -> tuple[Situation, Situation]:
     return before, after
 
 
+def without_a_file(directory: Path) -> Situation:
+    """Where not one file can be opened."""
+    store = Store(directory, 0)
+    store.commit([record(1)])
+    looked_at = plant(directory, store)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
+    situation = looked_at.situation()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    store.close()
+    return situation
+
+
+@pytest.fixture(scope="module")
+def alone() -> Iterator[ProcessPoolExecutor]:
+    """A process of its own: in this one, connections and threads of earlier tests end when they like, and without a
+    file to be had they fail."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        yield process
+
+
 @pytest.mark.slow
-def test_memory_threads_files_and_disk_are_the_processs_own(tmp_path: Path) -> None:
-    """In a process of its own: in this one, connections and threads of earlier tests end when they like."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as alone:
-        before, after = alone.submit(situations, tmp_path).result()
+def test_memory_threads_files_and_disk_are_the_processs_own(alone: ProcessPoolExecutor, tmp_path: Path) -> None:
+    before, after = alone.submit(situations, tmp_path).result()
     assert before.process is not None
     assert after.process is not None
     assert after.process.open_files - before.process.open_files == 7
@@ -95,15 +114,9 @@ def test_an_outbox_that_cannot_be_read_is_not_known(tmp_path: Path, store: Store
     assert plant(tmp_path, store).situation().publication.unpublished is None
 
 
-def test_without_a_file_to_be_had_it_goes_on(tmp_path: Path, store: Store) -> None:
-    store.commit([record(1)])
-    looked_at = plant(tmp_path, store)
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (0, hard))
-    try:
-        situation = looked_at.situation()
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+@pytest.mark.slow
+def test_without_a_file_to_be_had_it_goes_on(alone: ProcessPoolExecutor, tmp_path: Path) -> None:
+    situation = alone.submit(without_a_file, tmp_path).result()
     assert situation.process is None
     assert situation.publication.unpublished is None
 

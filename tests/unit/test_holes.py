@@ -66,7 +66,7 @@ def test_three_percent_of_lost_samples_leave_one_window(lost: str) -> None:
     assert not {"filled_samples", "reference_filled_samples"} & set(whole.numbers)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("lost", ["sensor", "reference"])
 def test_the_filtered_samples_are_those_without_loss(lost: str) -> None:
     """Twenty seeds: 3 % of the information is gone, and no more than that comes in as error.

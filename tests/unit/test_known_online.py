@@ -49,7 +49,7 @@ def stating(config: Config, **filters: list[str]) -> Config:
     return config.model_copy(update={"channels": (channel.model_copy(update=stated),)})
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("where", ["sensor", "reference"])
 def test_a_near_filter_that_is_stated_changes_neither_s_nor_q(where: str) -> None:
     found, without = told(where), told("")

@@ -168,7 +168,7 @@ def test_beside_turns_against_gravity_clocks_that_run_apart_are_found(rate: floa
     )  # of a period a sixteenth, of a sample a quarter
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("upper", "lag_s", "noise_mps2", "bursts"), [(1.6, 0.017, 0.01, True), (3.0, 0.0125, 0.035, False)]
 )

@@ -75,7 +75,7 @@ def through_the_wire(event_sequence: int, item: Any) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", STRUCTS)
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_every_event_and_result_comes_back_as_it_was(kind: type[msgspec.Struct], data: st.DataObject) -> None:
     item = data.draw(struct_items(kind))

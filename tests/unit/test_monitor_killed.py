@@ -18,8 +18,8 @@ pytest.importorskip("starlette", reason="the extra monitor is not installed")
 pytest.importorskip("uvicorn", reason="the extra monitor is not installed")
 from tests.unit.monitor_site import Monitor
 
-RESULTS = 5000
-KILLED_AT = (1, 1000, 2500)  # results in the database when the monitor is killed
+RESULTS = 3000
+KILLED_AT = (1, 1500)  # results in the database when the monitor is killed
 
 
 @pytest.fixture(params=["SQLite", "PostgreSQL"])

@@ -159,7 +159,7 @@ def test_the_monitor_says_what_the_files_say_and_what_it_said_lasts(tmp_path: Pa
         assert fleet.alarms() == []
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 def test_self_tests_are_in_the_sum_of_their_day(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
     few = [row for row in rows if row["sequence"] < 24 * 3 and row["gateway"] == "north"]
     database = Database(engine, now_ns=lambda: NOW_NS)
@@ -205,6 +205,7 @@ def test_hostile_hours_are_counted_and_change_nothing(tmp_path: Path, rows: list
         assert len(database.watch.left_out) == len(hostile) - 1, "of grids there are two"
 
 
+@pytest.mark.one_case
 def test_late_hours_make_their_day_anew(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
     few = rows[: 6 * 24 * 4]
     late = [row for row in few if row["sensor"] == "f" and row["sequence"] < 48]

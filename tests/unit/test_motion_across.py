@@ -83,7 +83,7 @@ def test_a_windows_bands_are_those_along_its_motion() -> None:
     assert data.bands.between.relative_u < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("across", [0.0, 0.3])
 def test_calibrate_counts_the_motion_across_that_the_sensor_shows(across: float) -> None:
     """With the default of 1 %: S of a sensor along z, of which the outputs x and y show motion across. What it tells of

@@ -65,6 +65,7 @@ def test_a_weak_axis_beside_motion_of_all_frequencies_is_within_u() -> None:
     assert abs(np.mean(errors)) < 1.2  # of six, this has an SD of 0.4
 
 
+@pytest.mark.slow
 def test_a_direction_near_the_noise_is_within_u_where_motion_fills_the_spectrum() -> None:
     """Nothing shows the noise of a reference at 100 Hz whose motion reaches 32 Hz. Taken for none, it made S of the
     weakest direction 7 % smaller: 6.9 u at most of these recordings."""

@@ -113,7 +113,7 @@ def in_force(seed: int) -> tuple[CalibrationUpdate, Array, Array]:
     return updates[-1], np.asarray(parameters.sensor.sensitivity) * h, np.asarray(parameters.sensor.offset)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_agent_is_right_at_that_frequency_as_well(seed: int) -> None:
     update, S, Q = in_force(seed)

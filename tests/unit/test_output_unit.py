@@ -143,7 +143,7 @@ def numbers(text: str, row: str, count: int) -> list[tuple[float, float]]:
     return [(float(value), float(U)) for value, U in found]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("unit", "one_g"), [("g", 1.0), ("mg", 1e3)])
 def test_an_output_in_g_is_shown_in_g_per_g_and_mg(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], unit: str, one_g: float

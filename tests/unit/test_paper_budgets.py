@@ -114,8 +114,8 @@ def squared_difference(seed: int) -> tuple[float, Array]:
     return float(d @ np.linalg.solve(C, d)), d**2 / np.diag(C)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("benches", [60, pytest.param(120, marks=pytest.mark.thorough)])
+@pytest.mark.one_case
+@pytest.mark.parametrize("benches", [40, 120])
 def test_the_methods_differ_as_their_budgets_say(benches: int) -> None:
     # Benches and sensors drawn from the priors; d (12) = S_2 - S_1 (main) and S_3 - S_1 (all). Sum of d' C^-1 d is
     # chi-squared of 12 degrees of freedom for each bench, band at 99.9 %; of each of the 12 alone, one degree of

@@ -55,7 +55,7 @@ def test_a_plane_tells_no_element_and_its_normal_is_named(kind: str, starts_and_
         assert np.abs(outcome.more["unexcited_directions"] @ of.axes[:, 2]) == pytest.approx([1.0], abs=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("starts_and_stops", [False, True])
 def test_a_tone_is_told_at_its_own_frequency(starts_and_stops: bool) -> None:
     """Before, at 10 to 28 Hz, where there is noise alone."""

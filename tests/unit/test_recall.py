@@ -86,7 +86,7 @@ def test_a_recording_and_a_data_directory_have_the_same_results_and_each_is_corr
     assert "not empty" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_thousand_results_take_seconds_and_each_file_is_signed(recorded: Path, tmp_path: Path) -> None:
     update = calibrations_of(recorded)[-1]
     many = [msgspec.structs.replace(update, run_id="many", sequence=k) for k in range(1, 1001)]

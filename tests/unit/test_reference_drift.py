@@ -59,7 +59,7 @@ def test_what_a_first_window_tells_of_s_is_as_uncertain_as_the_time_since_the_ce
     assert found.result().standard_uncertainty[SYY] == pytest.approx(expected, rel=0.06, abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(("stability", "walk"), [(STABILITY, WALK), (STABILITY, 0.0), (0.0, WALK)])
 def test_years_of_windows_divide_a_change_between_sensor_and_reference_as_both_are_stated(
     stability: float, walk: float

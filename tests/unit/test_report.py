@@ -134,7 +134,7 @@ def test_a_data_directory(recorded: tuple[Path, Truth], tmp_path: Path, capsys: 
     assert [len(f["sha256"]) for f in held["files"]] == [64]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_recording_gives_the_same_calibration_and_a_torn_one_what_it_has(
     recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

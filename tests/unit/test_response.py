@@ -70,7 +70,7 @@ def test_a_sensor_that_is_late_by_a_sixth_of_a_cycle() -> None:
     assert np.abs(error / u).max() < 4.0
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 def test_a_delay_of_two_and_a_half_periods_of_the_motion(side: str) -> None:
     """A linear-phase filter of 63 taps comes 258 ms late, 13 times the usual standard uncertainty of a lag."""
@@ -164,7 +164,7 @@ def test_a_resonance_at_one_and_a_half_times_slow_motion(side: str, seed: int) -
     assert np.abs(error / u).max() < 4.5
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 @pytest.mark.parametrize("order", [1, 2])
 def test_an_unknown_corner_at_a_fifth_of_slow_motion(order: int, side: str) -> None:

@@ -77,7 +77,7 @@ def calibrated(site: Path, station: str, capsys: pytest.CaptureFixture[str], *mo
     return json.loads(told.out), told.err
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_sensitivity_and_orientation_of_a_seismometer(
     site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -96,7 +96,6 @@ ROUNDS: dict[Behaviour, int] = {
 SOUND = ["UNCALIBRATED", "VALID"]
 
 
-@cache
 def test_a_silent_gateway_makes_no_more_results(tmp_path: Path) -> None:
     gateway = SimulatedGateway(FleetPlan(1, 1, 1, [], tmp_path), 0, "silent", Stories(1).sensors(0, "silent", 1))
     made = [gateway.step(T_NS + k * DAY_NS, NEVER) for k in range(BEGINS["silent"] + 2)]
@@ -106,6 +105,7 @@ def test_a_silent_gateway_makes_no_more_results(tmp_path: Path) -> None:
     assert gateway.truth()["since_utc_ns"] == T_NS + BEGINS["silent"] * DAY_NS
 
 
+@cache
 def told(behaviour: Behaviour) -> tuple[list[Result], dict[str, Any]]:
     """The results of a sensor, and the truth at the end. Its gateway's results have numbers from 1001 on."""
     other, sensor = (
@@ -172,7 +172,7 @@ def test_the_page_reads_what_the_agent_says_of_held_windows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("behaviour", ["sound", "drifting", "stepped"])
+@pytest.mark.parametrize("behaviour", ["sound", pytest.param("drifting", marks=pytest.mark.thorough), "stepped"])
 def test_u_covers_the_truth(behaviour: Behaviour) -> None:
     results, truth = told(behaviour)
     last = [r for r in results if isinstance(r, CalibrationUpdate)][-1]
@@ -229,7 +229,7 @@ def test_ctrl_c_ends_the_command_in_order(site: Site, tmp_path: Path) -> None:
     assert (tmp_path / "known").read_text().count("gateway simulated/gw") == 5
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_tells_that_a_process_has_ended(site: Site, tmp_path: Path) -> None:
     process = fleet_command(site, tmp_path)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()

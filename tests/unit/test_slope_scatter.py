@@ -22,7 +22,7 @@ RATE_HZ, SECONDS, NOISE = 200.0, 8.0, 0.01
 FREQUENCIES_HZ = np.array([1.3, 2.9, 4.7, 7.1])
 S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
 Q_TRUE = np.array([0.3, -0.1, 0.2])
-DRAWS, SEED = 30, 35
+DRAWS, SEED = 20, 35
 # Angles are drawn with these, and little else is uncertain: what a wrong weight costs then shows.
 PRIORS = Priors(
     angle_rad=2e-3,

@@ -164,7 +164,7 @@ def test_a_reference_known_to_a_tenth_of_a_per_cent_is_never_known_better(window
     assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 2 * 1.1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_nor_by_motion_askew_to_its_channels() -> None:
     """Which way it goes was measured by two channels, each with its own error: their ratio is no third standard."""
     random, found = np.random.default_rng(12), mounted(FIXED.with_values({"reference": 1e-3}))
@@ -315,7 +315,7 @@ def test_an_operators_calibration_is_where_it_goes_on_from() -> None:
     assert abs(found.result().sensitivity[1, 1] - S_TRUE[1, 1]) < 3e-3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_accepted_again_and_again_it_is_known_no_better() -> None:
     # The reference's 0.1 % is in S: were it met as a new one after each accept, u(S_yy) were 0.03 % after six.
     random, found = np.random.default_rng(12), mounted(FIXED.with_values({"reference": 1e-3}))

@@ -168,7 +168,7 @@ def test_files_of_verdicts_that_cannot_be_used(tmp_path: Path) -> None:
     assert suspicion_of(two, "pier") is None
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_report_and_export_use_the_enlarged_u(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     record(tmp_path / "data", 41.0)
     [recording] = (tmp_path / "data").glob("*.mcap")

@@ -141,7 +141,7 @@ def test_a_jump_of_the_sensitivity_is_no_shift_and_no_other_lag_is_tried(made: C
     assert [made[visit] for visit in range(FROM, FROM + 4)] == [1] * 4
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_lag_that_was_excluded_is_seldom_tried_again_but_another_one_at_once(made: Counter[int]) -> None:
     drawn = site()
     beyond_s = 4.0 * U_LAG_S + 0.01 - drawn.building.parameters.lag_s

@@ -87,7 +87,7 @@ def leaning(found: Estimation, stated: Pose, random: np.random.Generator, degree
     return hours(found, [window(random, stated, stated.direction[:, 0], gravity) for _ in range(12)], 10)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_a_lean_of_the_mount_is_within_the_uncertainty_of_the_offset(mount: str) -> None:
     random = np.random.default_rng(1)
