@@ -18,7 +18,7 @@ from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate
 from agent.site_watch.source import WatchError
 from calib.model import Array
-from calib.site_watch.verdicts import COVERAGE, SensorVerdict
+from calib.site_watch.verdicts import COVERAGE, NAMES, SensorVerdict
 from calib.site_watch.witnesses import Witness
 
 DAY_NS = 86_400 * 10**9
@@ -26,6 +26,7 @@ SOURCE = "suspected change"  # of a budget
 LARGEST_FILE = 64 << 20  # bytes of a file of verdicts; a sensor has 2 kB
 # Of calib.site_watch.together.DIRECTIONS; the last is of a gateway (direction -1).
 AXES_OF = ("x", "y", "z", "xyz", "x", "y", "z", "xyz")
+OTHER = ", or that of the other of two sensors against it: which one is not seen"
 TOLD_UNITS = {"turn": ("°", math.degrees(1.0)), "": (" %", 100.0)}
 
 
@@ -157,13 +158,14 @@ def suspicion_of(path: Path, sensor: str, gateway: str = "") -> Suspicion | None
 
 def sentence(told: SensorVerdict) -> str:
     """A suspected change with its witnesses, in words."""
-    what = told.what if told.kind != "gateway" else "sensitivity of all sensors of its gateway"
+    what = NAMES[told.direction] if told.kind != "gateway" else "sensitivity of all sensors of its gateway"
     if told.kind == "turn":
         change = f"{what} by {sized(told)}"
     else:
         change = f"{what} has {'fallen' if told.size < 0.0 else 'risen'} by {sized(told).lstrip('+-')}"
     heard = [_heard(one) for one in told.witnesses] or [f"the structure says so ({told.statistic:.1f} u)"]
-    return f"{change} since {since(told)}: {', '.join(heard)}"
+    other = OTHER if told.kind == "one of two" else ""
+    return f"{change} since {since(told)}{other}: {', '.join(heard)}"
 
 
 def frequency_sentence(told: SensorVerdict) -> str:
@@ -193,7 +195,7 @@ def relative(told: SensorVerdict) -> tuple[float, float]:
     """Size and U of a verdict as a part of the sensitivity; the watch tells its logarithm. An angle or a noise as it
     is.
     """
-    if told.kind in ("sensitivity", "gateway", "common", "structure"):
+    if told.kind in ("sensitivity", "one of two", "gateway", "common", "structure"):
         return math.expm1(told.size), math.exp(told.size) * told.U
     return told.size, told.U
 
