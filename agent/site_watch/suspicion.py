@@ -42,6 +42,7 @@ class ToldWitness(msgspec.Struct):
 class Suspicion(msgspec.Struct):
     """A change that the site tells of a sensor: of the sensitivity of `axes` (x, y, z or xyz), relative; or a `turn`
     about one axis, in rad. U with k = 2; dates of UTC. `visit_information_nat`: what a visit of the sensor would tell.
+    `one_of_two`: the change is of this sensor, or the opposite one of the only other sensor that tells anything.
     """
 
     gateway: str
@@ -56,6 +57,7 @@ class Suspicion(msgspec.Struct):
     witnesses: list[ToldWitness]
     text: str
     visit_information_nat: float | None = None
+    one_of_two: bool = False
 
     def enlarged(self, sensitivity: Array, covariance: Array) -> Array:
         """The covariance (12, 12) of S and Q with the suspected change; `sensitivity` (3, 3): S in force.

@@ -78,7 +78,7 @@ class SiteView:
             gateway=gateway, sensor=sensor, axes=AXES_OF[told.direction], turn=told.kind == "turn", size=size,
             expanded_uncertainty=U, since=date(told.since), earliest=date(told.earliest), latest=date(told.latest),
             witnesses=[witness_of(one) for one in told.witnesses], text=sentence(told),
-            visit_information_nat=dict(self.order).get(i),
+            visit_information_nat=dict(self.order).get(i), one_of_two=told.kind == "one of two",
         )  # fmt: skip
 
     @property

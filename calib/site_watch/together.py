@@ -23,8 +23,11 @@ DIRECTIONS = np.array(
      [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=float,
 )  # fmt: skip
 SENSITIVITIES, ALL, TURNS = slice(0, 4), 3, slice(4, 7)
-PRIOR_TESTS = 60.0  # that are worth what all of a site say at one begin of the scatter of its steps
-MEDIAN_SQUARE = 0.4549  # the median of the square of a standard normal deviate
+MEDIAN_SQUARE = 0.4549  # the median m of the square of a standard normal deviate
+# Tests that are worth what all of a site say at one begin of the scatter of its steps. The median of N squares has the
+# relative variance 5.44 / N, which is 1 / (N (2 m f)²) with their density f = 0.471 at m. So this prior is the best
+# one where the variances at begins differ from what is expected by 30 % (5.44 / 0.3² = 60). The 30 % are assumed.
+PRIOR_TESTS = 60.0
 REJECT = 6.0  # standard uncertainties from which a sensor or channel does not say what is common (Tukey's biweight)
 ROUNDS = 4
 FEWEST_TO_NAME = 3  # sensors with a band, for it to say which one has changed

@@ -116,6 +116,7 @@ def test_of_two_sensors_both_are_suspected(tmp_path: Path, clean: list[dict[str,
     assert {one["verdict"] for one in (c, d)} == {"one of two"}
     assert abs(c["size"] + 5.9) < c["expanded_uncertainty"] < 3.0
     assert [one["suspected"]["size"] for one in (c, d)] == pytest.approx([-0.059, 0.063], abs=0.015)
+    assert c["suspected"]["one_of_two"]
     assert c["suspected"]["text"].startswith("sensitivity of z has fallen by ")
     assert "or that of the other of two sensors against it: which one is not seen" in d["suspected"]["text"]
     assert "Of two sensors that differ it is not seen which one changed, unless a witness says so." in found["not_seen"]
