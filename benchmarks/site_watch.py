@@ -62,7 +62,7 @@ WORLDS = {
     "0.32 %, 24 h, 0.05 %/K": World(scatter_h=24.0, shape_per_k=5e-4),
     "0.88 %, 6 h, 0.02 %/K": World(scatter=0.0088),
 }
-ALARMS = "sensitivity", "turn", "sensor or structure"
+ALARMS = "sensitivity", "one of two", "turn", "sensor or structure"
 
 
 def learned(seed: int, sensors: int, world: World) -> tuple[Bridge, SiteWatch]:

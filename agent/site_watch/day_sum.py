@@ -31,9 +31,10 @@ SHAPES = {
     "self_test_u": "n3",
     "self_test_supply": "n3",
     "self_test_degc": "n",
+    "lag_h": "n",
 }
 SELF_TEST = "self_test", "self_test_u", "self_test_supply", "self_test_degc"  # as the fields of SelfTests
-EMPTY = {"frequency", *SELF_TEST}  # arrays that may be left out
+EMPTY = {"frequency", "lag_h", *SELF_TEST}  # arrays that may be left out
 
 
 class DaySum(msgspec.Struct, array_like=True, kw_only=True):
@@ -43,7 +44,7 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
     calibration of each sensor in force at the end of the day; `u_main` (n,): its relative standard uncertainty then;
     `main` (n, 3): its main sensitivities, NaN where they are not known. `self_test` and the others: the fields of
     calib.site_watch.day.SelfTests; empty where no sensor has tested itself. `frequency` (n, b, 3): that of Day; empty
-    where no result tells one.
+    where no result tells one. `lag_h` (n,): that of Day; empty where no clock is off.
     """
 
     number: int
@@ -63,6 +64,7 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
     self_test_supply: bytes = b""
     self_test_degc: bytes = b""
     frequency: bytes = b""
+    lag_h: bytes = b""
 
     def array(self, name: str) -> Array:
         """One of the arrays. Raises ValueError where its length is not that of its shape."""
@@ -111,6 +113,8 @@ def summed(
              "u_main": u_main, "main": np.array(main), **_self_tests(sensors, self_tests)}  # fmt: skip
     if np.isfinite(frequency).any():
         parts["frequency"] = day.frequency
+    if day.lag_h is not None:
+        parts["lag_h"] = day.lag_h
     return DaySum(number=number, sensors=sensors, bands=bands, temperature_degc=day.temperature_degc, made=made,
                   **{name: np.asarray(part, dtype="<f4").tobytes() for name, part in parts.items()})  # fmt: skip
 
@@ -158,6 +162,8 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
         frequency = np.full((n, b, 3), np.nan)
         frequency[to[:, None], to_bands] = one.array("frequency")[own[:, None], columns]
         noise[to], mean[to] = one.array("log_noise")[own], one.array("mean")[own]
+        lag_h = np.full(n, np.nan)
+        lag_h[to] = one.array("lag_h")[own]
         visits = Visits.unknown(np.array([False] * n))
         new_main, new_u = one.array("main"), one.array("u_main")
         for k, i in zip(own.tolist(), to.tolist(), strict=True):
@@ -169,7 +175,8 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
         tests = [np.full((n, 3) if SHAPES[name] == "n3" else n, np.nan) for name in SELF_TEST]
         for name, array in zip(SELF_TEST, tests, strict=True):
             array[to] = one.array(name)[own]
-        day = Day(one.number, value, u, level, noise, one.temperature_degc, mean, SelfTests(*tests), frequency)
+        day = Day(one.number, value, u, level, noise, one.temperature_degc, mean, SelfTests(*tests), frequency,
+                  np.nan_to_num(lag_h) if one.lag_h else None)  # fmt: skip
         yield SiteDay(day, visits, u_main.copy())
 
 

@@ -18,7 +18,7 @@ from agent.config.files import read_file
 from agent.core.events import CalibrationUpdate
 from agent.site_watch.source import WatchError
 from calib.model import Array
-from calib.site_watch.verdicts import COVERAGE, SensorVerdict
+from calib.site_watch.verdicts import COVERAGE, NAMES, SensorVerdict
 from calib.site_watch.witnesses import Witness
 
 DAY_NS = 86_400 * 10**9
@@ -26,6 +26,7 @@ SOURCE = "suspected change"  # of a budget
 LARGEST_FILE = 64 << 20  # bytes of a file of verdicts; a sensor has 2 kB
 # Of calib.site_watch.together.DIRECTIONS; the last is of a gateway (direction -1).
 AXES_OF = ("x", "y", "z", "xyz", "x", "y", "z", "xyz")
+OTHER = ", or that of the other of two sensors against it: which one is not seen"
 TOLD_UNITS = {"turn": ("°", math.degrees(1.0)), "": (" %", 100.0)}
 
 
@@ -41,6 +42,7 @@ class ToldWitness(msgspec.Struct):
 class Suspicion(msgspec.Struct):
     """A change that the site tells of a sensor: of the sensitivity of `axes` (x, y, z or xyz), relative; or a `turn`
     about one axis, in rad. U with k = 2; dates of UTC. `visit_information_nat`: what a visit of the sensor would tell.
+    `one_of_two`: the change is of this sensor, or the opposite one of the only other sensor that tells anything.
     """
 
     gateway: str
@@ -55,6 +57,7 @@ class Suspicion(msgspec.Struct):
     witnesses: list[ToldWitness]
     text: str
     visit_information_nat: float | None = None
+    one_of_two: bool = False
 
     def enlarged(self, sensitivity: Array, covariance: Array) -> Array:
         """The covariance (12, 12) of S and Q with the suspected change; `sensitivity` (3, 3): S in force.
@@ -157,13 +160,14 @@ def suspicion_of(path: Path, sensor: str, gateway: str = "") -> Suspicion | None
 
 def sentence(told: SensorVerdict) -> str:
     """A suspected change with its witnesses, in words."""
-    what = told.what if told.kind != "gateway" else "sensitivity of all sensors of its gateway"
+    what = NAMES[told.direction] if told.kind != "gateway" else "sensitivity of all sensors of its gateway"
     if told.kind == "turn":
         change = f"{what} by {sized(told)}"
     else:
         change = f"{what} has {'fallen' if told.size < 0.0 else 'risen'} by {sized(told).lstrip('+-')}"
     heard = [_heard(one) for one in told.witnesses] or [f"the structure says so ({told.statistic:.1f} u)"]
-    return f"{change} since {since(told)}: {', '.join(heard)}"
+    other = OTHER if told.kind == "one of two" else ""
+    return f"{change} since {since(told)}{other}: {', '.join(heard)}"
 
 
 def frequency_sentence(told: SensorVerdict) -> str:
@@ -193,7 +197,7 @@ def relative(told: SensorVerdict) -> tuple[float, float]:
     """Size and U of a verdict as a part of the sensitivity; the watch tells its logarithm. An angle or a noise as it
     is.
     """
-    if told.kind in ("sensitivity", "gateway", "common", "structure"):
+    if told.kind in ("sensitivity", "one of two", "gateway", "common", "structure"):
         return math.expm1(told.size), math.exp(told.size) * told.U
     return told.size, told.U
 

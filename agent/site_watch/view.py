@@ -26,7 +26,7 @@ from agent.site_watch.suspicion import (
     witness_of,
 )
 from calib.model import Array
-from calib.site_watch.verdicts import COVERAGE, WALK_PER_ROOT_DAY, SensorVerdict, SiteVerdicts, result
+from calib.site_watch.verdicts import COVERAGE, SUSPECTED, WALK_PER_ROOT_DAY, SensorVerdict, SiteVerdicts, result
 from calib.site_watch.visits import teach
 from calib.site_watch.watch import VISIT, SiteWatch
 
@@ -37,7 +37,9 @@ DO = {
     "none": "nothing",
     "learning": "wait",
     "sensitivity": "visit the sensor: its sensitivity has changed, or the structure at it, in all bands alike",
+    "one of two": "visit one of the two: its sensitivity has changed, or that of the other one",
     "turn": "visit the sensor: look whether its mount has turned",
+    "clock": "set the clock of its gateway: until then nothing else is told of the sensor",
     "noise": "look at its cable, supply and noise",
     "sensor or structure": "look at the sensor, its mount and the structure there",
     "structure": "look at the structure there",
@@ -66,7 +68,7 @@ class SiteView:
     def suspected(self, i: int) -> Suspicion | None:
         """What is suspected of the sensitivity or direction of a sensor: by itself, or with its gateway."""
         (gateway, sensor), told = self.source.sensors[i], self.found.sensors[i]
-        if told.kind not in ("sensitivity", "turn"):
+        if told.kind not in SUSPECTED:
             with_gateway = self.found.gateways.get(self.source.gateways.index(gateway))
             if with_gateway is None:
                 return None
@@ -76,7 +78,7 @@ class SiteView:
             gateway=gateway, sensor=sensor, axes=AXES_OF[told.direction], turn=told.kind == "turn", size=size,
             expanded_uncertainty=U, since=date(told.since), earliest=date(told.earliest), latest=date(told.latest),
             witnesses=[witness_of(one) for one in told.witnesses], text=sentence(told),
-            visit_information_nat=dict(self.order).get(i),
+            visit_information_nat=dict(self.order).get(i), one_of_two=told.kind == "one of two",
         )  # fmt: skip
 
     @property
@@ -114,7 +116,7 @@ def _order(
     for i, (told, (gateway, _)) in enumerate(zip(found.sensors, source.sensors, strict=True)):
         u2 = float(np.nan_to_num(u_main[i], nan=U_UNKNOWN)) ** 2 + WALK_PER_ROOT_DAY**2 * float(found.days[i])
         with_gateway = found.gateways.get(source.gateways.index(gateway))
-        if told.kind in ("sensitivity", "turn"):
+        if told.kind in SUSPECTED:
             u2 += told.size**2
         elif with_gateway is not None:
             u2 += with_gateway.size**2
@@ -158,6 +160,8 @@ def blind_spots(what: SiteView) -> list[str]:
         lines.append("A change of the whole gateway is not seen: the site has no other one.")
     elif len(gateways) == 2:
         lines.append("Of two gateways that differ it is not seen which one changed.")
+    if len(names) == 2:
+        lines.append("Of two sensors that differ it is not seen which one changed, unless a witness says so.")
     least = found.least_detectable.min(axis=1)
     blind = [i for i in range(len(names)) if not np.isfinite(least[i])]
     if blind:

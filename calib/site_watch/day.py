@@ -29,6 +29,8 @@ MAD = 1.4826  # standard deviation over the median of absolute deviations, of a 
 ROUNDS = 2  # of the median polish
 WIDTH = 10.0**0.05 - 10.0**-0.05  # of a third octave, over its nominal centre (IEC 61260-1)
 PAIRS = (0, 0, 1), (1, 2, 2)  # xy, xz, yz
+LAGS_H = -3, -2, -1, 1, 2, 3  # by which a clock is sought to be off
+LAG_LEFT = 0.05  # part of the squares of a sensor's hours that another clock must leave, at most, to be told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +72,8 @@ class Day:
     where a channel does not count. `level` (B, 3): log amplitude of the level. `log_noise` (n, 3): half the log of the
     noise floor. `temperature_degc`: the median of all sensors; NaN where none tells one. `mean_mps2` (n, 3): the median
     of the hours. `self_tests`: None where no sensor has one. `frequency` (n, B, 3): log of the peak frequency over the
-    centre of the band, NaN where too few hours tell it.
+    centre of the band, NaN where too few hours tell it. `lag_h` (n,): hours by which the clock of a sensor is late
+    against those of most others; its channels then do not count. None where no clock is off.
     """
 
     number: int
@@ -82,6 +85,7 @@ class Day:
     mean_mps2: Array | None = None
     self_tests: SelfTests | None = None
     frequency: Array | None = None
+    lag_h: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +117,9 @@ def day_of(hours: Hours, band_hz: Array) -> Day:
         cross = hours.cross / np.sqrt(signal[..., PAIRS[0]] * signal[..., PAIRS[1]])
         ratio = floor / signal
     cross = np.where(np.abs(cross) <= 1.5, cross, np.nan)
+    lag_h = _lag_h(amplitude)
+    late = lag_h != 0.0
+    amplitude[:, late], counts[:, late], cross[:, late] = np.nan, False, np.nan
     present = np.sum(counts, axis=0)  # (n, B, 3)
     value, level = _polished(amplitude)
     both = np.sum(np.isfinite(cross), axis=0)
@@ -131,8 +138,32 @@ def day_of(hours: Hours, band_hz: Array) -> Day:
         0.5 * np.log(_positive(_median(hours.noise_psd))),
         float(np.median(temperatures)) if temperatures.size else np.nan,
         None if hours.mean_mps2 is None else _median(hours.mean_mps2),
-        frequency=None if hours.frequency is None else _frequency(hours.frequency),
+        frequency=None
+        if hours.frequency is None
+        else np.where(late[:, None, None], np.nan, _frequency(hours.frequency)),
+        lag_h=lag_h if late.any() else None,
     )
+
+
+def _lag_h(amplitude: Array) -> Array:
+    """Whole hours by which each sensor (n,) indicates the level of the others late, from (H, n, B, 3); 0 where nothing
+    says so.
+
+    The level changes from hour to hour by much more than a sensor differs from it. Where a clock is k hours late, a
+    sensor differs at hour h by level[h - k] - level[h].
+    """
+    own = amplitude - _median(amplitude)
+    level = _median(np.moveaxis(own, 1, 0))  # (H, B, 3)
+    away, level = (_mean(np.moveaxis(one.reshape(*one.shape[:-2], -1), -1, 0)) for one in (own - level[:, None], level))
+    lag_h, least = np.zeros(away.shape[1]), LAG_LEFT * _mean(np.square(away))
+    for k in LAGS_H:
+        shown = np.full(len(level), np.nan)
+        shown[max(k, 0) : len(level) + min(k, 0)] = level[max(-k, 0) : len(level) - max(k, 0)]
+        moved = away - (shown - level)[:, None]
+        left = np.where(np.isfinite(moved).sum(axis=0) >= FEWEST_HOURS, _mean(np.square(moved)), np.inf)
+        better = left < least
+        lag_h, least = np.where(better, k, lag_h), np.where(better, left, least)
+    return lag_h
 
 
 def _frequency(hours: Array) -> Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.model import Array
 from calib.site_watch.day import PAIRS
@@ -22,10 +23,14 @@ DIRECTIONS = np.array(
      [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=float,
 )  # fmt: skip
 SENSITIVITIES, ALL, TURNS = slice(0, 4), 3, slice(4, 7)
-PRIOR_TESTS = 60.0  # that are worth what all of a site say at one begin of the scatter of its steps
-MEDIAN_SQUARE = 0.4549  # the median of the square of a standard normal deviate
+MEDIAN_SQUARE = 0.4549  # the median m of the square of a standard normal deviate
+# Tests that are worth what all of a site say at one begin of the scatter of its steps. The median of N squares has the
+# relative variance 5.44 / N, which is 1 / (N (2 m f)²) with their density f = 0.471 at m. So this prior is the best
+# one where the variances at begins differ from what is expected by 30 % (5.44 / 0.3² = 60). The 30 % are assumed.
+PRIOR_TESTS = 60.0
 REJECT = 6.0  # standard uncertainties from which a sensor or channel does not say what is common (Tukey's biweight)
 ROUNDS = 4
+FEWEST_TO_NAME = 3  # sensors with a band, for it to say which one has changed
 LARGEST_RATIO = 10.0  # of the amplitudes of two axes, for the cross power to tell of a turn
 
 
@@ -60,7 +65,8 @@ class JointChange:
     steps without what is common; `information` (k, n, B, 6): of these, over the variance. `statistic` (k, n, 7): the
     change over its u; of a turn the smaller one of this and the same without the band that says most, since the weak
     axis of one band says much of a turn, and moves by itself when the loads of two modes change. `scatter` (k, 1, 7):
-    factor of u by what all sensors of the site differ by."""
+    factor of u by what all sensors of the site differ by. `pair` (k,): no more than two
+    sensors can be compared, so that both show a change of either."""
 
     size: Array
     u: Array
@@ -68,6 +74,7 @@ class JointChange:
     information: Array
     statistic: Array
     scatter: Array
+    pair: NDArray[np.bool_]
 
     @property
     def evidence(self) -> Array:
@@ -81,7 +88,9 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
     `step`, `information` (k, n, B, 6); `inflation` (k, n, 7): variance of each direction over what independent
     channels have; `walk` (k,): standard uncertainty by which a sensitivity may have changed by itself.
     """
-    common, others = _common(step[..., :3], information[..., :3], np.sqrt(inflation[..., ALL]))
+    pair, information = _named_only(information)
+    inflation = np.where(pair[:, None, None], inflation.max(axis=1, keepdims=True), inflation)
+    common, others = _common(step[..., :3], information[..., :3], np.sqrt(inflation[..., ALL]), pair)
     # Each sensor against the others alone: its own part in what is common is taken out.
     rest, alone = step.copy(), information.copy()
     rest[..., :3] = np.where(others > 0.0, step[..., :3] - common, 0.0)
@@ -89,7 +98,9 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
     alone[..., :3] = information[..., :3] * others / np.where(both > 0.0, both, 1.0)
     score, squares = scores(rest, alone, G)
     size, u = _sized(score, squares, inflation, walk)
-    scatter = _scatter_of_all(size / u)
+    # Of two the level is the mean, so each shows half of what they differ by, and half of its scatter.
+    u[pair, :, SENSITIVITIES] *= np.sqrt(2.0)
+    scatter = np.where(pair[:, None, None], 1.0, _scatter_of_all(size / u))
     u *= scatter
     statistic = size / u
     apart = _without_loudest(rest, alone, G[..., 3:])
@@ -98,7 +109,17 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
         np.abs(statistic[..., TURNS]), np.sign(size[..., TURNS]) * size_apart / u_apart / scatter[..., TURNS]
     )
     statistic[..., TURNS] = np.sign(size[..., TURNS]) * np.maximum(least, 0.0)
-    return JointChange(size, u, rest, alone, statistic, scatter)
+    return JointChange(size, u, rest, alone, statistic, scatter, pair)
+
+
+def _named_only(information: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Whether only two sensors can be compared at a begin (k,); and the information, where three can only that of bands
+    and axes which at least three sensors tell of."""
+    tell = np.sum(information[..., :3] > 0.0, axis=1)
+    pair = (tell < FEWEST_TO_NAME).all(axis=(1, 2))
+    named = information.copy()
+    named[..., :3] *= ((tell >= FEWEST_TO_NAME) | pair[:, None, None])[:, None]
+    return pair, named
 
 
 def _sized(score: Array, squares: Array, inflation: Array, walk: Array) -> tuple[Array, Array]:
@@ -146,10 +167,11 @@ def scores(values: Array, information: Array, G: Array) -> tuple[Array, Array]:
     return (weighted * values.reshape(flat) @ g)[..., 0, :], (weighted @ np.square(g))[..., 0, :]
 
 
-def _common(y: Array, info: Array, scale: Array) -> tuple[Array, Array]:
+def _common(y: Array, info: Array, scale: Array, pair: NDArray[np.bool_]) -> tuple[Array, Array]:
     """What all other sensors share of the amplitudes, for each sensor (k, n, B, 3), and its information.
 
-    Iteratively reweighted: a sensor whose bands differ alike, or a channel that differs by itself, loses its weight.
+    Iteratively reweighted: a sensor whose bands differ alike, or a channel that differs by itself, loses its weight. Of
+    a `pair` (k,) both differ alike, so both keep it.
     """
     root, scale = np.sqrt(info), scale[:, :, None, None]
     axis = np.sqrt(np.maximum(info.sum(axis=2, keepdims=True), 1e-300)) * scale
@@ -160,7 +182,8 @@ def _common(y: Array, info: Array, scale: Array) -> tuple[Array, Array]:
         score = info * away
         sensor = np.abs(score.sum(axis=2, keepdims=True)) / axis
         alike = np.abs(score.sum(axis=(2, 3), keepdims=True)) / whole
-        weight = info * biweight(np.maximum(sensor, alike)) * biweight(away * root / scale)
+        trusted = biweight(np.maximum(sensor, alike)) * biweight(away * root / scale)
+        weight = info * np.where(pair[:, None, None, None], 1.0, trusted)
         sums, total = np.sum(weight * y, axis=1), np.sum(weight, axis=1)
         common = np.where(total > 0.0, sums / np.where(total > 0.0, total, 1.0), common)
     others = total[:, None] - weight

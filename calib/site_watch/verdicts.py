@@ -30,7 +30,7 @@ WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk a
 COVERAGE = 2.0
 APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the norm does not fit over seasons
 # Part of the variance of a sensor that all of its gateway share: they are neighbours, and shapes move smoothly along a
-# structure. Assumed.
+# structure. Assumed; the simulated bridge has 0.13 over 28 days (docs/site-watch.md).
 PART_SHARED = 0.25
 LEAST_NOISE = 0.03  # of the amplitude of the noise, for its change to be told: a sensitivity changes the noise alike
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
@@ -41,7 +41,8 @@ MONTH_DAYS = 30  # after a change, of which the least detectable one is told
 VISITS_DAYS = 400  # for which what a visit found says how far all sensors have changed alike
 LONGEST_DAYS = 365  # of the norm, over which the walk counts
 LEAST_VARIANCE = 0.2  # of a channel's variance, that a step leaves
-FOLLOW = "sensitivity", "turn", "sensor or structure", "gateway"  # what may follow from a change of a frequency
+SUSPECTED = "sensitivity", "one of two", "turn"  # verdicts of a sensor by itself that witnesses are asked of
+FOLLOW = *SUSPECTED, "sensor or structure", "gateway"  # what may follow from a change of a frequency
 EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told apart (2 standard deviations)
 
 
@@ -49,11 +50,12 @@ EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told a
 class SensorVerdict:
     """A verdict of a sensor or gateway.
 
-    `kind`: none, learning, sensitivity, turn, noise, structure, sensor or structure, gateway. `what`: in words.
-    `size`, `U`: change of the log of the sensitivity (relative change of the amplitude of the noise), or angle in
-    rad; expanded by COVERAGE. `since`, `earliest`, `latest`: days since 1970. `statistic`: size over its standard
-    uncertainty, or a normal equivalent. `direction`: index in calib.site_watch.together.DIRECTIONS of a sensitivity
-    or turn; -1 for others. `hz`: the natural frequency that has changed; NaN for others.
+    `kind`: none, learning, sensitivity, one of two, turn, noise, structure, sensor or structure, gateway, clock.
+    `what`: in words. `size`, `U`: change of the log of the sensitivity (relative change of the amplitude of the noise),
+    or angle in rad; expanded by COVERAGE. `since`, `earliest`, `latest`: days since 1970; -1 where none is told.
+    `statistic`: size over its standard uncertainty, or a normal equivalent. `direction`: index in
+    calib.site_watch.together.DIRECTIONS of a sensitivity or turn; -1 for others. `hz`: the natural frequency that has
+    changed; NaN for others.
     `witnesses`: of a sensitivity or turn, the structure first.
     """
 
@@ -146,6 +148,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
         for i in range(n):
             if sensors[i].kind == "none" and not anchored[i]:
                 sensors[i] = _sensor(tests, i, limit, floors[i])
+        _of_two(tests, sensors)
         gateways = _gateways(watch, tests, sensors, limit)
         _follow_frequencies([told for _, told in changed], sensors, gateways)
         site = max(_structure(tests, sensors), *(told for _, told in changed), NOTHING, key=lambda one: one.statistic)
@@ -153,6 +156,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
             common = _common_change(tests, known_u[anchored], anchored)
         sensors = [witnessed(watch, i, told) for i, told in enumerate(sensors)]
         least = _least_change(watch, tests, limit)
+    _clocks(watch, sensors)
     common = common or _common_by_visits(watch)
     outside = (watch.degc < watch.seen_degc[:, 0]) | (watch.degc > watch.seen_degc[:, 1])
     hidden = common.U if common is not None else np.inf
@@ -268,7 +272,7 @@ def _apart(joint: JointChange, G: Array) -> Array:
     squares = np.sum(own * np.square(r - fitted), axis=-1)
     freedom = np.sum(info > 0.0, axis=-1) - g.shape[-1]
     f = np.maximum(freedom, 1).astype(float)
-    site = median(np.where(freedom > 0, squares / f, np.nan), axis=1)
+    site = np.where(joint.pair, 1.0, median(np.where(freedom > 0, squares / f, np.nan), axis=1))
     ratio = squares / f / (APART_MISFIT * np.maximum(site, 1.0))[:, None]
     deviate = (np.cbrt(ratio) - (1.0 - 2.0 / (9.0 * f))) / np.sqrt(2.0 / (9.0 * f))
     return np.asarray(np.where(freedom > 0, deviate, -np.inf))
@@ -287,16 +291,33 @@ def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorV
             "sensor or structure", "its bands change differently", 0.0, np.inf, *dates, float(apart[worst])
         )
     if z > limit:
-        kind = "sensitivity" if direction <= ALL else "turn"
+        kind, what = "sensitivity" if direction <= ALL else "turn", NAMES[direction]
+        if tests.joint.pair[best] and kind == "sensitivity":
+            kind, what = "one of two", f"{what}, or that of the other sensor against it; which one is not seen"
         kind = kind if tests.bands[best, i] >= FEWEST_BANDS else "sensor or structure"
         size, u = tests.joint.size[best, i, direction], tests.joint.u[best, i, direction]
-        return SensorVerdict(kind, NAMES[direction], float(size), COVERAGE * float(u), *dates, z, direction)
+        return SensorVerdict(kind, what, float(size), COVERAGE * float(u), *dates, z, direction)
     return noise
+
+
+def _clocks(watch: SiteWatch, sensors: list[SensorVerdict]) -> None:
+    """A sensor of which nothing else is told, and whose hours were not those of the others on the last day."""
+    for i in np.flatnonzero(watch.lag_h).tolist():
+        if sensors[i].kind in ("none", "learning"):
+            hours, late = abs(int(watch.lag_h[i])), "late" if watch.lag_h[i] > 0.0 else "early"
+            sensors[i] = SensorVerdict("clock", f"its hours come {hours} h {late} against those of the other sensors")
+
+
+def _of_two(tests: Tests, sensors: list[SensorVerdict]) -> None:
+    """Where two sensors are compared, a turn of one moves the amplitudes of both: what the other one shows follows."""
+    turned = max((told.statistic for told in sensors if told.kind == "turn"), default=0.0)
+    if tests.joint.pair[-1]:
+        sensors[:] = [NOTHING if told.kind in FOLLOW and told.statistic < turned else told for told in sensors]
 
 
 def witnessed(watch: SiteWatch, i: int, told: SensorVerdict) -> SensorVerdict:
     """The verdict of sensor `i` with what each witness says of it at its date."""
-    if told.kind not in ("sensitivity", "turn"):
+    if told.kind not in SUSPECTED:
         return told
     k, u = watch.means.begins.index(told.since), told.U / COVERAGE
     step, u_step = (part[0, i] for part in _followed(watch, watch.means, watch.mean_scatter, [k]))
@@ -384,10 +405,10 @@ def _means(joint: JointChange, index: NDArray[np.int64], counts: NDArray[np.bool
 def _structure(tests: Tests, sensors: list[SensorVerdict]) -> SensorVerdict:
     """Damage: bands change differently at several sensors, or at most of them."""
     own = [i for i, told in enumerate(sensors) if told.kind == "sensor or structure"]
-    if len(own) >= 2:
-        apart = np.maximum(tests.apart[:, own].max(axis=1), 0.0)
-        best, dates = tests.dated(apart**2)
-        z = float(apart[best])
+    apart = np.maximum(tests.apart[:, own].max(axis=1, initial=0.0), 0.0)
+    best, dates = tests.dated(apart**2)
+    z = float(apart[best])
+    if len(own) >= 2 and not tests.joint.pair[best]:
         for i, told in enumerate(sensors):  # what is weaker than the damage may follow from it
             if told.kind in ("sensitivity", "turn") and told.statistic < z:
                 sensors[i] = NOTHING

@@ -22,7 +22,7 @@ ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
 FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, or its residual to count
 MEMORY_DAYS = 60.0  # of the scatter of days: frost, traffic and wind make it another one in each season
 PRIOR_BLOCKS = 30.0  # by which a sensor's own scatter of days is drawn to that of all: its test has no wide tails
-FEWEST_SENSORS = 3  # with a band, for its common level to be taken out
+FEWEST_SENSORS = 2  # with a band, for its common level to be taken out; of two it is their mean
 CHANNELS = 6
 WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
 U_SELF_TEST = 0.001  # of the log of a response, however little it scatters; only ratios of weights depend on it
@@ -59,6 +59,7 @@ class SiteWatch:
         self.origin = np.full((self.shape[1], 3), np.nan)  # levels of the first day
         self.seen_degc = np.tile([np.inf, -np.inf], (self.shape[0], 1))
         self.degc = np.nan  # of the last day
+        self.lag_h = np.zeros(self.shape[0])  # of each clock, on the last day that tells it
         self.G = np.zeros((*self.shape, CHANNELS))
 
     def update(self, day: Day, visits: Visits | None = None) -> None:
@@ -72,6 +73,9 @@ class SiteWatch:
         if visited.any():
             self._restart(visited)
         self.day, self.degc = day.number, day.temperature_degc
+        lag_h = np.zeros(self.shape[0]) if day.lag_h is None else day.lag_h
+        told = np.isfinite(day.value).any(axis=(1, 2)) | (lag_h != 0.0)
+        self.lag_h = np.where(told, lag_h, self.lag_h)
         there = np.isfinite(day.value) & ~visited[:, None, None]
         x = self._regressors(day)
         value = np.where(there, day.value, 0.0)
@@ -131,7 +135,7 @@ class SiteWatch:
         """The watch of a snapshot."""
         watch = cls(told["gateway"], told["band_hz"])
         watch.day, watch.degc = int(told["day"]), float(told["degc"])
-        for name in ("origin", "seen_degc", "G", "visits", "u_supply"):
+        for name in ("origin", "seen_degc", "G", "visits", "u_supply", "lag_h"):
             setattr(watch, name, told[name].copy())
         for name in _PARTS:
             getattr(watch, name).load(told[name])
@@ -232,7 +236,7 @@ class SiteWatch:
             self.seen_degc[told, 1] = np.maximum(self.seen_degc[told, 1], self.degc)
 
 
-_OWN = ("origin", "seen_degc", "degc", "G", "visits", "u_supply")
+_OWN = ("origin", "seen_degc", "degc", "G", "visits", "u_supply", "lag_h")
 _PARTS = (
     *("steps", "noise", "means", "self_tests", "frequencies"),
     *("days_scatter", "band_scatter", "noise_scatter", "mean_scatter", "self_test_scatter", "frequency_scatter"),

@@ -105,6 +105,42 @@ def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, cl
 
 
 @pytest.mark.slow
+def test_of_two_sensors_both_are_suspected(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    """z of sensor c indicates 6 % less; U of both must hold it, since nobody knows which one has changed."""
+    two = [dict(row) for row in clean if row["sensor"] in "cd"]
+    for row in two:
+        if row["sensor"] == "c" and row["sequence"] >= 24 * CHANGED:
+            row["band_power"] = [*row["band_power"][:8], *(value * 0.97**2 for value in row["band_power"][8:])]
+    found = json.loads(run(tmp_path, two, "--json", "-").stdout)
+    c, d = found["sensors"]
+    assert {one["verdict"] for one in (c, d)} == {"one of two"}
+    assert abs(c["size"] + 5.9) < c["expanded_uncertainty"] < 3.0
+    assert [one["suspected"]["size"] for one in (c, d)] == pytest.approx([-0.059, 0.063], abs=0.015)
+    assert c["suspected"]["one_of_two"]
+    assert c["suspected"]["text"].startswith("sensitivity of z has fallen by ")
+    assert "or that of the other of two sensors against it: which one is not seen" in d["suspected"]["text"]
+    assert "Of two sensors that differ it is not seen which one changed, unless a witness says so." in found["not_seen"]
+    assert found["site"]["verdict"] == "none"
+
+
+@pytest.mark.slow
+def test_a_gateway_whose_clock_is_an_hour_off_is_named(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
+    few = [dict(row) for row in clean if row["sequence"] < 24 * 5]
+    for row in few:
+        row["hour_utc_ns"] += HOUR_NS if row["gateway"] == "north" else 0
+    told = run(tmp_path, few, "--json", "-")
+    assert told.return_value == 3
+    found = json.loads(told.stdout)["sensors"]
+    assert {one["sensor"]: one["verdict"] for one in found} == dict.fromkeys("ab", "clock") | dict.fromkeys(
+        "cdef", "learning"
+    )
+    late = [one for one in found if one["verdict"] == "clock"]
+    assert {one["what"] for one in late} == {"its hours come 1 h late against those of the other sensors"}
+    assert {(one["size"], one["since"], one["suspected"]) for one in late} == {(None, None, None)}
+    assert "set the clock of its gateway" in run(tmp_path, few).output
+
+
+@pytest.mark.slow
 def test_nulls_other_grids_and_sensors_that_come_and_go(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     rows = [dict(row) for row in clean if row["sequence"] < 24 * CHANGED]
     rows = [row for row in rows if row["sensor"] != "f" or row["sequence"] > 24 * 20]

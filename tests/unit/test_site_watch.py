@@ -189,6 +189,52 @@ def test_of_two_gateways_it_is_not_told_which_and_of_one_nothing_is_seen() -> No
         assert kinds(found) == {}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("gateway", [[0, 0], [0, 1]])
+def test_of_two_sensors_it_is_not_told_which_one_has_changed(gateway: list[int]) -> None:
+    """Both verdicts are of one size with opposite signs; nothing is told of two that stay; a turn is of one sensor."""
+    site, changes = Site(11, np.array(gateway)), np.zeros((3, 2, 6))
+    watch = watched(site, 60)
+    changes[0, 1, 2], changes[2, 1, 4] = -0.02, 0.0175
+    z, none, turn = (
+        result(watched(copy.deepcopy(site), 12, SiteWatch.loaded(watch.snapshot()), change)) for change in changes
+    )
+    assert kinds(z) == {0: "one of two", 1: "one of two"}
+    one, other = z.sensors
+    assert one.what == "sensitivity of z, or that of the other sensor against it; which one is not seen"
+    assert abs(other.size + 0.02) < other.U < 0.01
+    assert (one.size, one.U, one.since) == pytest.approx((-other.size, other.U, other.since))
+    assert z.site.kind == "none"
+    assert not z.gateways
+    assert kinds(none) == {}
+    assert kinds(turn) == {1: "turn"}
+
+
+@pytest.mark.slow
+def test_the_false_alarms_of_two_sensors_are_those_of_one_comparison() -> None:
+    """The statistic of two sound sensors is a standard normal deviate, or less: over 16 sites its root mean square is
+    at most 1.1. Were the scatter of their difference taken for half of it, as the level would have it, it were 1.28."""
+    z = []
+    for seed in range(16):
+        tests = examined(watched(Site(300 + seed, np.array([0, 0])), 60))
+        assert tests is not None
+        assert tests.joint.pair.all()
+        z.append(tests.joint.statistic[-1, 0, :ALL])
+    assert np.sqrt(np.mean(np.square(z))) < 1.1
+
+
+def test_a_band_of_two_sensors_names_none_where_three_are_compared_in_others() -> None:
+    one, none = np.ones((1, 9, 7)), np.zeros(1)
+    step, information, G = steps_of(np.zeros((9, 6, 3)))
+    information[0, :7, 0, 0] = 0.0
+    step[0, 7, 0, 0] = 0.5
+    told = jointly(step, information, G, one, none)
+    assert not told.pair.any()
+    assert np.abs(told.statistic).max() < 1e-6
+    information[0, 6, 0, 0] = 1e4
+    assert jointly(step, information, G, one, none).statistic[0, 7, 0] > 5.0
+
+
 def test_bands_that_change_differently_are_the_structure(learned: tuple[Site, SiteWatch]) -> None:
     for sensors, kind in (([1], "sensor or structure"), ([1, 2, 3], "structure")):
         site, watch = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot())
@@ -392,6 +438,47 @@ def test_hours_are_merged_without_their_levels_and_without_noise() -> None:
     assert np.isnan(quiet.value[0, 0]).all()
     assert np.isinf(quiet.u[0, 0]).all()
     assert np.isfinite(quiet.value[0, 1:]).all()
+
+
+def hours_of(number: int, late: dict[int, int], level: Array) -> Hours:
+    """A day of nine sensors; `late`: hours by which the clock of some is late. `level` (72, B, 3): of three days, of
+    which this is the middle one."""
+    random, bands = np.random.default_rng(number), len(BANDS_HZ)
+    own = np.random.default_rng(1).normal(0, 0.4, (9, bands, 3))
+    amplitude = np.empty((24, 9, bands, 3))
+    for i in range(9):
+        at = 24 - late.get(i, 0)
+        amplitude[:, i] = own[i] + level[at : at + 24] + random.normal(0, 0.02, (24, bands, 3))
+    cross = 0.3 * np.exp(amplitude[..., [0, 0, 1]] + amplitude[..., [1, 2, 2]])
+    none = np.full((24, 9, 3), 1e-9)
+    return Hours(24.0 * number + np.arange(24.0), np.exp(2.0 * amplitude), cross, none, np.full((24, 9), 12.0))
+
+
+def test_a_clock_that_is_hours_off_is_told_and_its_hours_do_not_count() -> None:
+    random = np.random.default_rng(10)
+    level = np.repeat(random.normal(0, 0.3, (72, 1, 1)), 3, axis=2) + random.normal(0, 0.05, (72, len(BANDS_HZ), 3))
+    for late in ({}, {0: 1, 1: 1, 2: 1}, {4: -2}, {3: 3, 7: -1}):
+        day = day_of(hours_of(20_000, late, level), BANDS_HZ)
+        expected = [late.get(i, 0) for i in range(9)]
+        assert (day.lag_h is None) == (not late)
+        assert np.array_equal(np.zeros(9) if day.lag_h is None else day.lag_h, expected)
+        assert np.isnan(day.value).all(axis=(1, 2)).tolist() == [i in late for i in range(9)]
+
+
+@pytest.mark.slow
+def test_a_gateway_whose_clock_is_an_hour_off_is_told_as_its_clock() -> None:
+    """For 12 days, then its clock is set: nothing else is told of it, and nothing of the others."""
+    random, watch = np.random.default_rng(11), SiteWatch(GATEWAY, BANDS_HZ)
+    hourly = np.repeat(random.normal(0, 0.3, (24 * 75, 1, 1)), 3, axis=2) + random.normal(0, 0.05, (24 * 75, 6, 3))
+    for k in range(70):
+        late = dict.fromkeys((3, 4, 5), 1) if 45 <= k < 57 else {}
+        watch.update(day_of(hours_of(20_000 + k, late, hourly[24 * k : 24 * k + 72]), BANDS_HZ))
+        if k == 56:
+            found = result(SiteWatch.loaded(watch.snapshot()))
+            assert kinds(found) == dict.fromkeys((3, 4, 5), "clock")
+            assert found.sensors[3].what == "its hours come 1 h late against those of the other sensors"
+            assert not found.gateways
+    assert kinds(result(watch)) == {}
 
 
 def test_directions_name_all_parts_once() -> None:

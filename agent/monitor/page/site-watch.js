@@ -22,7 +22,7 @@ export function suspectedWords({ suspected: s }) {
   const heard = s.witnesses.map((w) => witness(w, s.turn)).join(", "), says = (what) => s.witnesses.slice(1).some((w) => w.says === what), contradicted = says("contradicts"), agreed = says("agrees");
   return {
     say: ["Suspected: ", ...change, " since ", ...when(s), "."],
-    more: [heard ? `${heard[0].toUpperCase()}${heard.slice(1)}. ` : "All sensors of its gateway have changed alike. ", contradicted && !agreed ? "So rather the structure at the sensor, or its mount, has changed." : agreed && !contradicted ? "So the sensor itself has changed." : "The sensor has changed, or the structure at it moves otherwise in all bands alike."],
+    more: [heard ? `${heard[0].toUpperCase()}${heard.slice(1)}. ` : "All sensors of its gateway have changed alike. ", s.one_of_two ? "Or that of the only other sensor has changed against it: which one is not seen. " : "", contradicted && !agreed ? "So rather the structure at the sensor, or its mount, has changed." : agreed && !contradicted ? "So the sensor itself has changed." : "The sensor has changed, or the structure at it moves otherwise in all bands alike."],
   };
 }
 

@@ -1,0 +1,129 @@
+"""What the site watch assumes of its scatter, measured at simulated sites, and what happens where it is wrong by two.
+
+    python -m benchmarks.site_watch_assumed [--sites 6] [--write]
+
+Of PRIOR_TESTS: the mean factor on u, where all tests of a site have once, twice and four times the variance that is
+expected. Of PART_SHARED: how far the scores of sensors correlate, of one gateway and of two, in blocks of days (sensors
+without anything in common have -1/7 at a site of 8, since the level is theirs); and how often a gateway that has
+changed for 14 days is told as this gateway.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import copy
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.beam_world import BANDS_HZ, Bridge
+from benchmarks.page import write_part
+from benchmarks.site_watch import GATEWAYS, LEARNED_DAYS
+from calib.model import Array
+from calib.site_watch import together, verdicts
+from calib.site_watch.day import day_of
+from calib.site_watch.together import ALL, DIRECTIONS
+from calib.site_watch.watch import SiteWatch
+
+SENSORS, LATE_DAYS, FIRST_DAY, DRAWS = 8, 14, 30, 300
+PRIORS, SHARED, SIZES = (30.0, 60.0, 120.0), (0.125, 0.25, 0.5), (-0.01, 0.005)
+BLOCKS = 1, 7, 28
+
+
+class Heard(SiteWatch):
+    """A watch that keeps the score of each sensor and day, of all three axes together."""
+
+    def __init__(self, gateway: Array, band_hz: Array) -> None:
+        super().__init__(gateway, band_hz)
+        self.scores: list[Array] = []
+        take = self.days_scatter.update
+        self.days_scatter.update = lambda z, there: (self.scores.append(z[:, ALL].copy()), take(z, there))  # type: ignore[func-returns-value,method-assign,assignment,return-value]
+
+
+def factors() -> list[str]:
+    """Mean factor on u by the scatter of all sensors, for each size of site, true variance and prior."""
+    random, used = np.random.default_rng(1), together.PRIOR_TESTS
+    lines = [
+        "| sensors | variance over the expected one | " + " | ".join(f"factor, {p:g} tests" for p in PRIORS) + " |"
+    ]
+    lines.append("| --- | --- | " + " | ".join("---" for _ in PRIORS) + " |")
+    for sensors in GATEWAYS:
+        for variance in (1.0, 2.0, 4.0):
+            z, cells = np.zeros((DRAWS, sensors, len(DIRECTIONS))), []
+            z[..., :3] = random.normal(0.0, np.sqrt(variance), (DRAWS, sensors, 3))
+            z[..., 4:] = random.normal(0.0, 1.0, (DRAWS, sensors, 3))
+            for together.PRIOR_TESTS in PRIORS:
+                cells.append(f"{together._scatter_of_all(z)[:, 0, 0].mean():.2f}")
+            lines.append(f"| {sensors} | {variance:g} | {' | '.join(cells)} |")
+    together.PRIOR_TESTS = used
+    return lines
+
+
+def shared(sites: int) -> list[str]:
+    """Correlations of scores, and gateways that are told, for each part that is taken as common."""
+    told: Counter[tuple[float, float]] = Counter()
+    correlation: dict[int, list[tuple[float, float]]] = {days: [] for days in BLOCKS}
+    for seed in range(1000, 1000 + sites):
+        bridge = Bridge(seed, SENSORS, GATEWAYS[SENSORS])
+        bridge.hour = 24 * (61 * seed % 365)
+        days = [day_of(hours, BANDS_HZ) for hours in bridge.days(LEARNED_DAYS)]
+        watch = Heard(bridge.gateway, BANDS_HZ)
+        for day in days[:-LATE_DAYS]:
+            watch.update(day)
+        _correlated(np.array(watch.scores)[FIRST_DAY:], bridge.gateway, correlation)
+        for gateway in range(bridge.gateways):
+            for size in SIZES:
+                changed = SiteWatch.loaded(copy.deepcopy(watch.snapshot()))
+                for day in days[-LATE_DAYS:]:
+                    value = day.value.copy()
+                    value[bridge.gateway == gateway, :, :3] += np.log1p(size)
+                    changed.update(replace(day, value=value))
+                _told(changed, gateway, size, told)
+        print(f"site {seed - 999} of {sites}", flush=True)
+    cases = sites * GATEWAYS[SENSORS]
+    lines = ["| part that is common | " + " | ".join(f"{100 * s:+g} %: told as this gateway" for s in SIZES) + " |"]
+    lines.append("| --- | " + " | ".join("---" for _ in SIZES) + " |")
+    lines += [f"| {part:g} | {' | '.join(f'{told[part, size]} of {cases}' for size in SIZES)} |" for part in SHARED]
+    lines += ["", "| blocks of | correlation within a gateway | between gateways |", "| --- | --- | --- |"]
+    for number, pairs in correlation.items():
+        mean, u = np.mean(pairs, axis=0), np.std(pairs, axis=0) / np.sqrt(sites)
+        lines.append(f"| {number} d | {mean[0]:.2f} ± {2.0 * u[0]:.2f} | {mean[1]:.2f} ± {2.0 * u[1]:.2f} |")
+    return lines
+
+
+def _correlated(scores: Array, gateway: Array, correlation: dict[int, list[tuple[float, float]]]) -> None:
+    same = (gateway[:, None] == gateway) & ~np.eye(len(gateway), dtype=bool)
+    for days, pairs in correlation.items():
+        whole = len(scores) // days * days
+        c = np.corrcoef(scores[:whole].reshape(-1, days, len(gateway)).sum(axis=1).T)
+        pairs.append((float(c[same].mean()), float(c[gateway[:, None] != gateway].mean())))
+
+
+def _told(watch: SiteWatch, gateway: int, size: float, told: Counter[tuple[float, float]]) -> None:
+    used = verdicts.PART_SHARED
+    for verdicts.PART_SHARED in SHARED:
+        told[verdicts.PART_SHARED, size] += list(verdicts.result(watch).gateways) == [gateway]
+    verdicts.PART_SHARED = used
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sites", type=int, default=6)
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args()
+    lines = [
+        f"`python -m benchmarks.site_watch_assumed --sites {given.sites}`.",
+        "",
+        *factors(),
+        "",
+        *shared(given.sites),
+    ]
+    if given.write:
+        write_part("site-watch assumed", "\n".join(lines))
+    else:
+        print("\n".join(lines))
