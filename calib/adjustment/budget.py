@@ -19,8 +19,6 @@ from calib.model import Array
 from calib.windows.banded import Banded
 from calib.windows.deviations import BetweenBands
 
-NOTHING = Across()
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Budget:
@@ -41,9 +39,7 @@ class Budget:
     consistency: tuple[float, float]  # chi-squared of the windows against noise and stated scatter, and its expectation
 
 
-def budget(
-    solution: Solution, stated_offset_scatter_mps2: float, known_u: float = 0.0, across: Across = NOTHING
-) -> Budget:
+def budget(solution: Solution, stated_offset_scatter_mps2: float, known_u: float, across: Across) -> Budget:
     """The budget of a solution. `stated_offset_scatter_mps2` is the prior scatter of the offset between windows,
     `known_u` relative of S: whose filter differs from what is stated. `across`: what was taken out of an output."""
     seen = between_windows(solution)

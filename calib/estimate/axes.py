@@ -191,7 +191,7 @@ def silent_directions(unexcited: Array) -> str:
     if len(unexcited) == 1:
         return f"the motion is in a plane, and nothing moves along its normal {_in_axes(unexcited[0])}"
     if len(unexcited) == 2:
-        return f"all motion is along one direction, {_in_axes(np.cross(*unexcited))}"
+        return f"all motion that the reference measures is along one direction, {_in_axes(np.cross(*unexcited))}"
     return ""
 
 

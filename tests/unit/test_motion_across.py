@@ -108,6 +108,15 @@ def beside_one_axis(u: Array, V: Array) -> Any:
     return calibrate((time_s, V), {"time_s": time_s, "a": u[:, 0]}, poses=poses, reference_coupling="dc")
 
 
+@pytest.mark.slow
+def test_outputs_that_are_copies_are_no_motion_across() -> None:
+    """A logger that has one channel three times: what the outputs have in common is not taken out of the one along."""
+    u, _, V = moved(1, 0.5, 0.01, np.eye(3), np.array([0.0, 0.0, 1.0]))
+    told = beside_one_axis(u, V[:, [2, 2, 2]] + 1e-3 * np.random.default_rng(7).standard_normal(V.shape))
+    assert told.status == "refused"
+    assert "the sensor is turned against what was stated" in told.reasons[0]
+
+
 @pytest.mark.parametrize("across", [0.5, 1.5])
 def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(across: float) -> None:
     """What it moves across follows what it moves along differently in each octave, by its modes. S is off by 3 % in

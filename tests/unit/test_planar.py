@@ -69,7 +69,7 @@ def test_one_direction_is_named_as_such() -> None:
     world = World("band", directions=1)
     of = made(world, 3)
     outcome = calibrated(world, of)
-    assert "all motion is along one direction" in outcome.reasons[0]
+    assert "all motion that the reference measures is along one direction" in outcome.reasons[0]
     assert np.abs(np.abs(named(outcome)) - np.abs(of.axes[:, 0])).max() < 4e-3
 
 
