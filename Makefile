@@ -53,7 +53,7 @@ test: $(VENV)/development  ## before a merge: what decides whether results, unce
 
 # The drivers' contract reads 1,000 samples here.
 test-quick: export FIELDCAL_CONTRACT_SAMPLES = 1000
-test-quick: $(VENV)/development  ## before a commit: modules, properties and drivers, in a minute and a half
+test-quick: $(VENV)/development  ## before a commit: modules, properties and drivers, in under two minutes
 	$(call tested,$(PROCESSES),-m "not faults and not thorough and not slow" tests/unit tests/properties tests/contract)
 
 test-thorough: $(VENV)/development  ## what `make test` leaves out: worlds of months, other adapters, more seeds
