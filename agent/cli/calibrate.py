@@ -61,7 +61,7 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
 @click.option(
     "--reference-coupling",
     type=_choice("reference_coupling"),
-    help="Default: dc for three axes that feel gravity, else ac.",
+    help="Default: dc for three axes, unless only the sensor feels gravity; else ac.",
 )
 @click.option(
     "--coupling", type=_choice("coupling"), default=DEFAULTS.coupling, show_default=True, help="Coupling of the sensor."

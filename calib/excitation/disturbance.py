@@ -103,7 +103,7 @@ def against_noise(points: Points, reference_noise: Array, *, knocked: bool) -> N
     return _filter(weights, edges, size, rate_hz, lowest_hz, len(u), reference_noise)
 
 
-def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float, derivatives: int = 0) -> Array:
+def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float, derivatives: int) -> Array:
     """The reference's noise (2, m) in u and du/dt, no larger than what of u the sensor does not show.
 
     Noise that is thought to be white may be coloured, or a motion that fills the spectrum. Where both contradict each

@@ -285,16 +285,15 @@ class _Search:
             self.stated, self._latest = told, None
             self.narrower = narrower_bands(_used(windows), self._priors.reference_frequency_hz)
         if self._latest is None or self._latest[0] is not windows or self._latest[1] != taken:
-            self._latest = windows, taken, self._adjusted(windows, taken)
+            self._latest = windows, taken, self._adjustment(windows, taken)
         return self._latest[2]
 
-    def _adjusted(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
+    def _adjustment(self, windows: Sequence[Window], taken: Applied) -> Adjustment:
         """The adjustment; where it shows a corner below the motion that is nearer than the priors of its terms allow
-        for, once more with wider ones."""
+        for, once more with wider ones, which are stated from then on."""
         while True:
-            found = adjust(_used(windows), self.stated, taken)
-            terms = () if found.response is None else found.response.terms.terms
-            nearer = self.stated.response_model.nearer(np.array(terms)) if terms else None
+            found, model = adjust(_used(windows), self.stated, taken), self.stated.response_model
+            nearer = None if found.response is None else model.nearer(found.response.terms)
             if nearer is None:
                 return found
             self.stated = replace(self.stated, response_model=nearer)

@@ -52,11 +52,14 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
         found = causes(sensor, reference, poses, outcome)
         return replace(outcome, calibration=None, reasons=(*found, *silent, *outcome.reasons))
     told = [*outcome.warnings, *axis_warnings(outcome.sensitivity), *silent]
-    if reference is not None and options.method == 3 and _coupled(options, sensor, reference).corners_alike:
+    if reference is None:
+        return replace(outcome, warnings=tuple(told))
+    setting = _setting(options, sensor, reference)
+    if options.method == 3 and _coupled(instrument_of(options), setting).corners_alike:
         told.append(CORNERS_ALIKE)
-    if reference is not None and _setting(options, sensor, reference).reference_coupling == "dc":
+    if setting.reference_coupling == "dc":
         told += gravity_warnings(reference)
-    elif reference is not None and options.reference_coupling is None:
+    elif options.reference_coupling is None:
         told += unconfirmed_unit(reference)
     return replace(outcome, warnings=tuple(told))
 
@@ -92,7 +95,7 @@ def tables_of(
         instrument = replace(instrument, quantity=reference.quantity)
         _check_quantity(reference, options.reference_quantity)
     setting = _setting(options, sensor, reference)
-    instrument = _coupled(options, sensor, reference, instrument)
+    instrument = _coupled(instrument, setting)
     if reference is not None and setting.reference_coupling == "dc":
         check_gravity(reference)
     intervals = _intervals(poses, setting, reference)
@@ -102,13 +105,10 @@ def tables_of(
     return Tables(sensor, reference, intervals, instrument, Making(settings, align=more))
 
 
-def _coupled(
-    options: Options, sensor: SensorTable, reference: ReferenceTable | None, instrument: Instrument | None = None
-) -> Instrument:
-    """The instrument, by default that of the options, with the couplings of reference and sensor."""
-    setting = _setting(options, sensor, reference)
+def _coupled(instrument: Instrument, setting: PoseSettings) -> Instrument:
+    """The instrument with the couplings of reference and sensor."""
     ac, sensor_ac = (coupling == "ac" for coupling in (setting.reference_coupling, setting.coupling))
-    return replace(instrument or instrument_of(options), ac_coupled=ac, sensor_ac_coupled=sensor_ac)
+    return replace(instrument, ac_coupled=ac, sensor_ac_coupled=sensor_ac)
 
 
 def _check_quantity(reference: ReferenceTable, stated: str | None) -> None:

@@ -133,12 +133,12 @@ class ResponseModel:
         """The corner whose terms are the scale of the priors of those below the motion."""
         return max(self.from_hz / LOWER, self.seen_corner_hz)
 
-    def nearer(self, terms: Array) -> ResponseModel | None:
-        """The same for an instrument whose corner is nearer to the motion than the priors allow for, as the terms (K,)
-        that were found show; None where they allow for it."""
+    def nearer(self, found: Response) -> ResponseModel | None:
+        """The same for an instrument whose corner is nearer to the motion than the priors allow for, as the response
+        that was found shows; None where they allow for it."""
         if not self.from_hz:
             return None
-        seen_hz = abs(float(terms[ALL_POWERS.index(-1)])) / (2.0 * np.pi)
+        seen_hz = abs(found.terms[ALL_POWERS.index(-1)]) / (2.0 * np.pi)
         allowed_hz = max(self.from_hz / NEARER, ALLOWED * self.seen_corner_hz)
         return replace(self, seen_corner_hz=seen_hz) if seen_hz > allowed_hz else None
 
