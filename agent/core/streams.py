@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from agent.config import Channel
 from agent.core.estimation import DAY_S, Estimation, Judged
 from agent.core.positions import FOUND_WITHIN_S, FoundPositions
+from agent.core.quiet_hours import QuietHours
 from agent.core.raw_watch import RawWatch
 from agent.core.schedule import PosePiece, ToldTimes, pose_beside
 from agent.core.stream import DeviceStream
@@ -67,6 +68,7 @@ class Streams:
         self._places = self._finder or ToldTimes(channel)
         self._runs: dict[str, int] = {}  # of each device, the number of the run of which the last part was
         self._raw = RawWatch(self._horizon_s)
+        self._quiet = QuietHours()
         self._margin_at: tuple[list[float | None], float] = [], 0.0  # margin in s, and the rates of which it follows
 
     def begin(self, origin_ns: int) -> None:
@@ -131,6 +133,7 @@ class Streams:
         """Another device has this name now: samples of the one before are nothing to it."""
         self.by_device[device].clear()
         self._raw.forget(device)
+        self._quiet.forget(device)
 
     def forget_sensor(self) -> None:
         """Another device takes the sensor's place: samples of the one before are nothing to it."""
@@ -227,6 +230,7 @@ class Streams:
             if placed.pose is None or unusable:
                 found = StretchWindows([refused(piece, unusable or placed.reason)])
             else:
+                self._listen(span_s, day)
                 found, lag_s, anew = self._windows(replace(piece, pose=placed.pose), first_s, day, estimation)
         found = found.with_numbers(placed.numbers)
         for window in found.windows:
@@ -235,6 +239,14 @@ class Streams:
                 judged = estimation.judge(window, day, lag_s, found.temperature_degc, anew, self.place)
                 anew = None  # the first window has set the lag in the state
             yield JudgedWindow(window, judged, lag_s)
+
+    def _listen(self, span_s: tuple[float, float], day: float) -> None:
+        """Take note of how noisy the reference is at most, by its samples of a part."""
+        beside = self._beside[self.place]
+        cut = None if beside.reference is None else self.by_device[beside.reference].cut(*span_s)
+        if cut is not None and cut.in_time:
+            values = cut.values / beside.instrument.sensitivity
+            self._quiet.update(cut.device, day, values, cut.clock.rate_hz)
 
     def _look_for_restarts(self, start_s: float, stop_s: float, estimation: Estimation | None) -> None:
         """A device that began to count anew since the last part may be late by another time."""
@@ -252,6 +264,7 @@ class Streams:
             "places": self._places.snapshot(),
             "run_numbers": dict(self._runs),
             "raw": self._raw.snapshot(),
+            "quiet": self._quiet.snapshot(),
             "piece_number": self._number,
         }
 
@@ -263,6 +276,7 @@ class Streams:
         self._places.load(state["places"])
         self._runs, self._number = dict(state["run_numbers"]), state["piece_number"]
         self._raw.load(state["raw"])
+        self._quiet.load(state.get("quiet", {}))  # not in states of engine 22 and before
 
     @property
     def _sensor(self) -> DeviceStream:
@@ -368,4 +382,5 @@ class Streams:
 
     def _make(self, piece: PosePiece, first_s: float, response: Response, to_hz: float, lag_s: float) -> StretchWindows:
         beside, limits = self._beside[self.place], self._limits[self.place]
-        return windows_in(piece, first_s, beside, self.by_device, lag_s, response, to_hz, limits)
+        most_noise = self._quiet.most_noise(beside.reference or "")
+        return windows_in(piece, first_s, beside, self.by_device, lag_s, response, to_hz, limits, most_noise)

@@ -63,17 +63,18 @@ def windows_in(
     response: Response = FLAT,
     to_hz: float = np.inf,
     limits: Limits = DEFAULT_LIMITS,
+    most_noise: tuple[float, ...] = (),
 ) -> StretchWindows:
     """The windows of a stretch in one pose, each with its verdict; one unused window where there is nothing to judge.
 
     `first_s` is the time of the sensor's first sample; the windows' times count from it. The sensor's indications are
     taken to come late by `lag_s`, and to be what `response` makes of the motion. Motion above `to_hz` is filtered out.
-    `limits` as `limits_of` gives them.
+    `limits` as `limits_of` gives them, `most_noise` as in calib.excitation.front_end.Settings.
     """
     span_s = first_s + piece.start_s, first_s + piece.stop_s
 
     def made(limit_hz: float | None) -> list[Window]:
-        settings = Settings(limits, bands=True, to_hz=limit_hz)
+        settings = Settings(limits, bands=True, to_hz=limit_hz, most_noise=most_noise)
         return windows_of(
             piece.pose, sensor, reference, channel.instrument, span_s, lag_s, settings, response=response
         )  # fmt: skip

@@ -20,6 +20,9 @@ FILTER_BAND = FILTER_BANDS[0]
 LEAST_MOTION_MPS2 = 0.1
 TOO_FAST = 0.01  # of the power of the reference: what interpolation loses of so little does not show
 AS_FAST = 0.9  # of the sensor's rate; two devices of one nominal rate differ by less
+# Power over that of the quietest window: with more, motion is in the noise; from MOSTLY on it is most of it, and the
+# share that the sensor shows, which is right to a tenth or so, leaves nothing, or several times the noise.
+BESIDE_MOTION, MOSTLY = 1.5, 5.0
 
 
 def band_to_keep(
@@ -31,6 +34,7 @@ def band_to_keep(
     widest_hz: Array,
     to_hz: float | None,
     together: Array,
+    most: Array,
 ) -> tuple[float | None, Array, float]:
     """Where to limit both signals, None where that gains nothing; the reference's noise (2, m) in what is left, and the
     relative standard uncertainty of its power.
@@ -38,7 +42,8 @@ def band_to_keep(
     `rates_hz`: of the reference and of the sensor. `widest_hz` (2,): the bands of the noise in u and du/dt that
     interpolation leaves (calib.signal.resampling.Resampled). `to_hz` as in Settings. `together` (k, 3 + m): V and u at
     the same times. What looks like white noise of the reference, and the sensor shows as well, is motion. Where motion
-    fills the spectrum, the noise is between none and all that is left where it moves least.
+    fills the spectrum, the noise is between none and all that is left where it moves least. `most` (m,): most_noise of
+    Settings.
     """
     rate_hz, derivatives, m = rates_hz[0], instrument.derivatives, raw.shape[1]
     found_hz, density = band_above_noise(raw, rate_hz)
@@ -53,10 +58,13 @@ def band_to_keep(
     if noisy and found_hz is not None and len(together):
         beyond_hz = found_hz, BAND * min(rates_hz)
         moves = moving_share(together[:, 3:], together[:, :3], rates_hz[1], beyond_hz, derivatives)
-        density = np.maximum(density * np.sqrt(1.0 - moves), stated)
+        density = np.maximum(_of_quieter(density, density * np.sqrt(1.0 - moves), most), stated)
     u_noise = U_NOISE
     if found_hz is None and not stated:
-        density, u_noise = quietest(raw, rate_hz) / np.sqrt(2.0), 1.0 / np.sqrt(3.0)
+        all_left = quietest(raw, rate_hz)
+        density, u_noise = _of_quieter(all_left, all_left / np.sqrt(2.0), most), 1.0 / np.sqrt(3.0)
+        if (density == most).all():
+            u_noise = U_NOISE
         unlimited = noise_in_bands(
             instrument.known.noise(float(widest_hz[0]), rate_hz) * density, widest_hz, derivatives
         )
@@ -68,6 +76,13 @@ def band_to_keep(
     noise_hz = np.minimum(np.array(FILTER_BANDS[derivatives : derivatives + 2]) * band_hz, widest_hz)
     noise = noise_in_bands(instrument.known.noise(float(noise_hz[0]), rate_hz) * density, noise_hz, derivatives)
     return band_hz, noise, u_noise
+
+
+def _of_quieter(density: Array, beside_motion: Array, most: Array) -> Array:
+    """(m,) the density of the noise: `beside_motion`, what of the `density` of this window is not motion as far as it
+    tells by itself; no more than the `most` of other windows, and just that where it is motion mostly."""
+    times = density**2 > BESIDE_MOTION * most**2, density**2 > MOSTLY * most**2
+    return np.where(times[1], most, np.where(times[0], np.minimum(beside_motion, most), beside_motion))
 
 
 def _limit_hz(

@@ -66,6 +66,8 @@ class Settings:
     `limits`: what a window must keep to be used. `bands`: windows with motion hold sums in bands as well, for which the
     share `taper` of them is tapered at each end. `to_hz`: both signals are limited so that no motion above it is left;
     None leaves it. `from_hz`: what is slower is filtered out of both likewise, but for the means; 0 leaves it.
+    `most_noise`: of each channel of the reference, in its own SI unit per root Hz, the density that its noise does not
+    exceed as other windows tell; () where nothing told it.
     """
 
     limits: Limits = DEFAULT_LIMITS
@@ -75,6 +77,7 @@ class Settings:
     to_hz: float | None = None
     from_hz: float = 0.0
     taper: float = TAPER
+    most_noise: tuple[float, ...] = ()
 
 
 DEFAULT_SETTINGS = Settings()
@@ -186,7 +189,8 @@ def aligned(
     if hums_hz:
         columns = without_lines(columns, sensor_rate_hz, hums_hz)
     rates_hz, together = (rate_hz, sensor_rate_hz), columns[np.isfinite(columns).all(axis=1) & inside, : 3 + m]
-    band_hz, noise, u_noise = band_to_keep(raw, u, V, instrument, rates_hz, noise_hz, settings.to_hz, together)
+    most = np.array(settings.most_noise) if settings.most_noise else np.full(m, np.inf)
+    band_hz, noise, u_noise = band_to_keep(raw, u, V, instrument, rates_hz, noise_hz, settings.to_hz, together, most)
     clipped, independent, unfiltered = 0, 1.0, as_measured.columns if struck.any() else columns
     if band_hz is not None and settings.limit_band:
         independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)

@@ -22,7 +22,7 @@ from calib.geometry import AXES, STANDARD_GRAVITY_MPS2
 from calib.model import PARAMETERS, Array, Window
 from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.measurement_result import NuisanceValue
-from calib.recorded.narrower import Band, narrower_bands
+from calib.recorded.narrower import Band, band_below_gap, narrower_bands
 from calib.recorded.options import Options
 from calib.recorded.outcome import Outcome, nothing_used
 from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
@@ -221,7 +221,11 @@ def _turned(search: _Search, priors: Priors, applied: Applied, turn: int, rate_h
     outcome = _outcome(found, windows, rate_hz, deviates)
     if outcome.calibration is None:
         outcome = replace(outcome, more={**outcome.more, **_response(search.by_band(found, applied.lag_s))})
-    narrower = search.narrower if deviates and outcome.reasons == tuple(deviates) else ()
+    narrower: tuple[Band, ...] = ()
+    if outcome.calibration is None:
+        narrower = band_below_gap(_used(windows), priors.reference_frequency_hz)
+    if deviates and outcome.reasons == tuple(deviates):
+        narrower += search.narrower
     return _AdjustedOutcome(outcome, found, narrower)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.model import Array, Window
-from calib.windows.bands import motion_band_hz
+from calib.windows.bands import below_gap_hz, motion_band_hz
 
 Band = tuple[float, float]  # in Hz; an end of 0 limits nothing
 # Octaves cut off the motion's band at its lower and at its upper end, from wide to narrow. The list is fixed
@@ -40,6 +40,13 @@ def narrower_bands(windows: Sequence[Window], stated_hz: float) -> tuple[Band, .
         and _share(windows, low_hz if below else 0.0, high_hz) >= LEAST_POWER
     ]
     return tuple(kept)
+
+
+def band_below_gap(windows: Sequence[Window], stated_hz: float) -> tuple[Band, ...]:
+    """The band of the motion below a gap of two octaves, as between waves and an engine: no smooth response is told
+    across it. Empty where there is no such gap, or where S is to hold above it, at `stated_hz`."""
+    end_hz = below_gap_hz(windows)
+    return () if end_hz is None or stated_hz > end_hz else ((0.0, end_hz),)
 
 
 def _share(windows: Sequence[Window], low_hz: float, high_hz: float) -> float:

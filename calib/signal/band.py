@@ -24,6 +24,7 @@ FEWEST_LINES = 64  # samples in a segment
 TINY = 1e-300
 WIDEST = 0.35  # of the sampling rate: above this a filter would remove hardly any noise
 ROLLS_OFF, QUIETEST = 0.4, 0.05  # of the sampling rate; of the lines
+OF_NOISE = 0.88  # times the density of white noise: what `quietest` says of noise alone, in windows of a minute
 STOP_BAND_DB = 66.0
 STOP_BAND = 1.5  # times the band that the filter passes
 HALVED = 1.25  # times the band that the filter passes: where half of an amplitude is left
@@ -74,6 +75,13 @@ def quietest(x: Array, rate_hz: float) -> Array:
     smooth = np.array([np.convolve(own, np.ones(SMOOTHED) / SMOOTHED, "valid") for own in lines])
     floor = np.quantile(smooth, QUIETEST, axis=1) if segments else np.zeros(x.shape[1])
     return np.sqrt(floor / (0.5 * rate_hz * np.sum(hanning(size) ** 2)))
+
+
+def most_noise(x: Array, rate_hz: float) -> Array:
+    """(m,) the amplitude density of x (n, m) beside its motion, or where it is quietest: its white noise is no more
+    than that, and as much where nothing else is there. In the unit of x per root Hz; 0 if x is too short."""
+    band_hz, density = band_above_noise(x, rate_hz)
+    return density if band_hz is not None else quietest(x, rate_hz) / OF_NOISE
 
 
 def power_share_above(x: Array, rate_hz: float, from_hz: float) -> float:

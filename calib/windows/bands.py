@@ -30,6 +30,9 @@ RELATED = 1e-9  # relative eigenvalue of the channels' scatter below which a dir
 OVER_NOISE = 100.0
 # A response is told by motion that has so large a share of its power in so many third octaves.
 LEAST_SHARE, FEWEST_THIRDS = 1e-2, 4
+# Ratio of frequencies without motion between them: no smooth response is told across it. The motion below counts where
+# it holds so much of the power.
+GAP, BELOW_GAP = 4.0, 0.05
 LEAST_SHOWN = 0.25  # of V in a band, by the motion: with less, the reference's noise may look like motion
 HIGHEST = 1.001  # times the upper end of the motion: a band that ends there is rounded
 LEAKED = 1.0  # of the power of a band, that may be of motion at other frequencies: with more, it shows their response
@@ -206,7 +209,8 @@ def share_above(bands: BandSums | None, to_hz: float) -> float:
 def motion_band_hz(windows: Sequence[Window], *, lasting: bool = False) -> tuple[float, float] | None:
     """The band in Hz of the motion of all windows. None where no window has bands, or where the motion is in a few
     narrow bands only (sines), which cannot tell a response over frequency. `lasting`: of a band in which the motion
-    comes and goes, only the power counts that is there for half of the time."""
+    comes and goes, only the power counts that is there for half of the time; and only motion below a gap of two
+    octaves, such as between the waves that move a platform and the engine on it."""
     bands = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
     if not bands:
         return None
@@ -216,14 +220,48 @@ def motion_band_hz(windows: Sequence[Window], *, lasting: bool = False) -> tuple
     if not power.sum() > 0.0:
         return None
     third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(np.int64)
-    shares = np.array([power[third == k].sum() for k in distinct(third)]) / power.sum()
-    if np.count_nonzero(shares > LEAST_SHARE) < FEWEST_THIRDS:
+    end_hz = _end_below_gap(bands, each) if lasting else None
+    if end_hz is not None and _tells_response(third, np.where(high <= end_hz, power, 0.0)):
+        below = [b.high_hz <= end_hz for b in bands]
+        each = [(np.where(own, a, 0.0), np.where(own, b, 0.0)) for own, (a, b) in zip(below, each, strict=True)]
+        power, square = (np.concatenate(part) for part in zip(*each, strict=True))
+    if not _tells_response(third, power):
         return None
     below, above = _narrowed(low, high, power, square)
     surely_low = max(_end(b.low_hz, b.low_hz, own, BELOW) for b, (own, _) in zip(bands, each, strict=True))
     surely_high = min(_end(b.high_hz, -b.high_hz, own, ABOVE) for b, (own, _) in zip(bands, each, strict=True))
     low_hz, high_hz = _end(below, below, power, BELOW), _end(above, -above, power, ABOVE)
     return min(low_hz, surely_low), max(high_hz, surely_high)
+
+
+def _tells_response(third: NDArray[np.int64], power: Array) -> bool:
+    """Whether motion with this `power` in bands of these third octaves is in FEWEST_THIRDS of them."""
+    shares = np.array([power[third == k].sum() for k in distinct(third)]) / power.sum()
+    return bool(np.count_nonzero(shares > LEAST_SHARE) >= FEWEST_THIRDS)
+
+
+def _end_below_gap(bands: Sequence[BandSums], each: Sequence[tuple[Array, Array]]) -> float | None:
+    """Where motion with at least the share BELOW_GAP of the power ends in Hz, below a gap of at least the ratio GAP;
+    None where there is no such gap. `each`: the powers of the bands of a window, as `_powers` gives them."""
+    low, high = (np.concatenate([getattr(b, name) for b in bands]) for name in ("low_hz", "high_hz"))
+    power = np.concatenate([own for own, _ in each])
+    moved = np.concatenate([own > ABOVE * own.sum() for own, _ in each])
+    order = np.argsort(low[moved], kind="stable")
+    ends_hz = np.maximum.accumulate(high[moved][order])
+    for end_hz, next_hz in zip(ends_hz, low[moved][order][1:], strict=False):
+        if next_hz > GAP * end_hz and power[high <= end_hz].sum() >= BELOW_GAP * power.sum():
+            return float(end_hz)
+    return None
+
+
+def below_gap_hz(windows: Sequence[Window]) -> float | None:
+    """Where the motion of the longest of these windows ends below a gap of two octaves; None where there is no gap. The
+    bands of a short window are too wide to tell."""
+    bands = [w.bands for w in windows if w.bands is not None and len(w.bands.points)]
+    if not bands:
+        return None
+    longest = max(bands, key=lambda own: float(own.points.sum()))
+    return _end_below_gap([longest], [_powers(longest)])
 
 
 def lowest_hz(windows: Sequence[Window]) -> float:

@@ -81,6 +81,8 @@ REVISIONS = (
     # The last before a floor of motion, weaker than the sensor's noise, was no noise of the reference any more.
     Revision(20, "00b8cff4d62e", "0.3.0"),
     Revision(21, "d6ede69441d7", "0.3.0"),
+    # The last before the noise of a reference is that of its quietest windows, and motion ends below a gap.
+    Revision(22, "6120401ea8aa", "0.3.0"),
 )
 
 
