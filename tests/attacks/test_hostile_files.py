@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 FILES = 25
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_no_hostile_file_ends_a_command_with_a_fault() -> None:
     """No exit status but 0, 2 and 3, no traceback, no control character, memory and CPU time within the limits."""
     run = [sys.executable, "-m", "benchmarks.hostile_files", "--quick", "--count", str(FILES)]

@@ -161,6 +161,7 @@ def test_a_page_and_a_figure_obey_nothing() -> None:
     assert len(figure_text("y" * 10_000)) < 100
 
 
+@pytest.mark.thorough
 def test_a_report_of_a_hostile_result_is_made(tmp_path: Path) -> None:
     """Names, units and reasons in a RESULT.json that somebody else made."""
     label, long = "$\\frac{-->" + HOSTILE, "y" * 100_000

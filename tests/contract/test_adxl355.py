@@ -120,7 +120,7 @@ class TestAdxl355(I2cContract):
         rig.put(Adxl355Twin(rig.counts, rig.due, lambda: rig.t_s, identity=rig.twin_class.own_identity))
         rig.sensor.open()
 
-    @pytest.mark.slow
+    @pytest.mark.thorough
     @on_one_adapter
     def test_a_temperature_that_changes_while_it_is_read_is_not_torn(self, rig: Adxl355Rig) -> None:
         # 0x6FF and 0x700 in turn, every 1.7 ms: of 300 single readings, some have the high byte of one and the low byte

@@ -80,7 +80,7 @@ def stated(lines: tuple[str, ...], frequency_hz: Array) -> tuple[Complex, Array]
     return h, np.sqrt(np.sum(np.square(moved), axis=0))
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("driver", "twin_class", "rate_hz", "exact"),
     [

@@ -156,7 +156,7 @@ def test_missing_samples_are_counted_by_the_clock(rig: MipRig) -> None:
     assert after.first_index == before.first_index + before.n + 7
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 def test_power_lost_underway(rig: MipRig) -> None:
     rig.open()
     list(rig.blocks(11.0))

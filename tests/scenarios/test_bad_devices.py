@@ -99,6 +99,7 @@ def test_unplugged_and_back_it_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     assert changes[-4:] == ["lost", "open", "lost", "open"]
 
 
+@pytest.mark.thorough
 def test_garbage_is_counted_and_the_samples_go_on(tmp_path: Path, port: PtyDevice) -> None:
     data_dir, output = tmp_path / "data", tmp_path / "output"
     with started("run", configuration(tmp_path, port.path), "--data-dir", data_dir, output=output) as agent:
@@ -116,6 +117,7 @@ def test_garbage_is_counted_and_the_samples_go_on(tmp_path: Path, port: PtyDevic
     assert not any(isinstance(event, DeviceChange) and event.state == "lost" for event in seen)
 
 
+@pytest.mark.thorough
 def test_a_missing_port_is_said_and_waited_for(tmp_path: Path) -> None:
     data_dir, output, link = tmp_path / "data", tmp_path / "output", tmp_path / "late-port"
     with started("run", configuration(tmp_path, link), "--data-dir", data_dir, output=output) as agent:
@@ -131,6 +133,7 @@ def test_a_missing_port_is_said_and_waited_for(tmp_path: Path) -> None:
     assert "Traceback" not in output.read_text()
 
 
+@pytest.mark.thorough
 def test_a_silent_device_turns_the_status_invalid_by_tick(tmp_path: Path) -> None:
     silent = itertools.repeat(b"")
     device = PtyDevice(lambda _: next(silent), link=tmp_path / "port")

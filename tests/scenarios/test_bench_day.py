@@ -51,6 +51,7 @@ def test_a_garbled_line_makes_no_place_deaf(said: float) -> None:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.thorough) for k in (1, 2))])
 def test_reads_that_beat_with_the_samples_cost_no_window(seed: int) -> None:
     """Sensor and reference are read every 16 and 10 ms at 200 Hz: the lag differs by about 0.3 ms between windows.

@@ -37,7 +37,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "page", [pytest.param(p, marks=[] if p.name in FIRST else pytest.mark.thorough, id=p.name) for p in PAGES]
 )

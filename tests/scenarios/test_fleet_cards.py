@@ -330,6 +330,7 @@ def test_a_page_whose_monitor_hangs_looks_old_and_goes_on_when_it_answers_again(
     monitor.stop()
 
 
+@pytest.mark.thorough
 def test_names_on_the_plan_cover_no_other(site: Site, tmp_path: Path, browser: Any) -> None:
     """Twelve sensors in three rows, so near that not all names find a place beside their points."""
     places = {f"site/gw/deck-{k:02}": ((k % 4) / 3, 0.3 + 0.02 * (k // 4)) for k in range(12)}

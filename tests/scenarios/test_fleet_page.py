@@ -245,6 +245,7 @@ def test_commands_with_and_without_the_right(site: Site, tmp_path: Path, browser
         gateway.close()
 
 
+@pytest.mark.thorough
 def test_a_killed_gateway_is_shown_and_a_restarted_monitor_has_the_whole_history(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:

@@ -48,6 +48,7 @@ def test_there_are_forty() -> None:
     assert len(WRITERS) >= 40
 
 
+@pytest.mark.one_case
 @pytest.mark.filterwarnings("default")  # the libraries' own
 @pytest.mark.parametrize(  # `make test` has each fourth
     "name", [pytest.param(name, marks=pytest.mark.thorough if k % 4 else ()) for k, name in enumerate(WRITERS)]
@@ -71,6 +72,7 @@ def test_the_same_s_and_q(
         np.testing.assert_allclose(writer.full_scale * np.array(found[value]), wanted, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.one_case
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_broken_file_ends_in_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

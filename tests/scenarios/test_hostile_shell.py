@@ -80,6 +80,7 @@ def test_calibrate_on_control_c_ends_with_130(tmp_path: Path) -> None:
     assert "Traceback" not in output.read_text()
 
 
+@pytest.mark.thorough
 def test_json_goes_to_a_file(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     told = fieldcal("calibrate", "--sensor", rests(tmp_path), "--json", path)

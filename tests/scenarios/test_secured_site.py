@@ -155,6 +155,7 @@ def test_a_gateway_sees_a_copy_of_itself_and_no_other(site: SecuredSite, monkeyp
             token.undeclare()
 
 
+@pytest.mark.thorough
 def test_commands_from_end_to_end(site: SecuredSite) -> None:
     with commanded_agent(site, "anna") as data_dir:
         signing = ["--key", str(site.keys / "anna.command.key")]

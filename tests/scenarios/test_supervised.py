@@ -101,6 +101,7 @@ def agent(tmp_path: Path, imu: PtyDevice, site: Site, systemd: Systemd) -> Itera
     process.wait()
 
 
+@pytest.mark.thorough
 def test_it_tells_how_it_is_from_beginning_to_end(
     tmp_path: Path, imu: PtyDevice, site: Site, systemd: Systemd, agent: subprocess.Popen[bytes]
 ) -> None:
@@ -134,6 +135,7 @@ def test_it_tells_how_it_is_from_beginning_to_end(
     assert (first, set(between), last) == ("open", {"lost"}, "open")
 
 
+@pytest.mark.thorough
 def test_an_agent_that_stands_still_does_not_feed(systemd: Systemd, agent: subprocess.Popen[bytes]) -> None:
     wait_until(lambda: systemd.has("WATCHDOG=1"), 60, "fed")
     agent.send_signal(signal.SIGSTOP)
@@ -143,6 +145,7 @@ def test_an_agent_that_stands_still_does_not_feed(systemd: Systemd, agent: subpr
     assert systemd.fed_within(WATCHDOG_S)
 
 
+@pytest.mark.thorough
 def test_an_absent_device_does_not_keep_it_from_being_ready(
     imu: PtyDevice, systemd: Systemd, agent: subprocess.Popen[bytes]
 ) -> None:

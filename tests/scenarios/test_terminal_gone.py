@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from tests.scenarios.processes import ROOT, interrupt, recordings, wait_until
 
 CONFIG = """
@@ -49,6 +51,7 @@ def on_a_terminal(tmp_path: Path, *, controlling: bool) -> Iterator[tuple[subpro
         agent.wait()
 
 
+@pytest.mark.thorough
 def test_hung_up_it_ends_as_with_ctrl_c(tmp_path: Path) -> None:
     with on_a_terminal(tmp_path, controlling=True) as (agent, person):
         os.close(person)
@@ -56,6 +59,7 @@ def test_hung_up_it_ends_as_with_ctrl_c(tmp_path: Path) -> None:
     assert [path.suffix for path in recordings(tmp_path / "data")][-1] == ".mcap"
 
 
+@pytest.mark.thorough
 def test_a_terminal_that_is_gone_does_not_stop_it(tmp_path: Path) -> None:
     data_dir = tmp_path / "data"
     with on_a_terminal(tmp_path, controlling=False) as (agent, person):

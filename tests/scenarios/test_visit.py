@@ -58,6 +58,7 @@ def test_two_visits_with_a_turned_and_a_loose_clamp(tmp_path):
         assert (out / visit["sensor"] / "result.json").is_file()
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -143,7 +143,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Run]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_bug_costs_what_it_breaks_and_nothing_else(runs: dict[str, Run], bug: str) -> None:
     found = runs[bug]
@@ -249,7 +249,7 @@ def test_arrays_that_the_driver_uses_again_are_recorded_as_they_were(tmp_path: P
     assert found.audit == 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_flood_of_blocks_takes_nothing_from_another_device(tmp_path: Path) -> None:
     bug = "a flood"
     found = run(one(bug), tmp_path, lambda found: sum(isinstance(e, SampleBlock) for e in found.of("good")) > 20)
@@ -274,7 +274,7 @@ def written(tmp_path: Path, bug: str) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("bug", "says"),
     [
@@ -299,7 +299,7 @@ def test_doctor_names_a_driver_with_a_bug(
     assert "samples a second" in found[1]["says"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_driver_that_cannot_be_made_is_a_fault_of_the_configuration(tmp_path: Path) -> None:
     done = fieldcal("run", written(tmp_path, "it cannot be made"), "--data-dir", tmp_path / "data")
     assert done.returncode == 2

@@ -22,7 +22,7 @@ QUIET = BenchParameters(motion=sine(3.0, 0.0), handling_mps2=0.0)
 COLOURED = replace(faulty(3), sensor=replace(faulty(3).sensor, coloured_noise_mps2=0.05, coloured_phi=0.999))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @settings(max_examples=20, deadline=None)
 @given(cuts=st.lists(st.integers(0, 4 * BLOCK), min_size=1, max_size=6), backwards=st.booleans())
 def test_chunks_make_no_difference(cuts, backwards) -> None:
@@ -72,7 +72,7 @@ def test_white_noise_has_its_sd_and_is_white() -> None:
     assert abs(np.corrcoef(drawn_first, reference)[0, 1]) < 4 / np.sqrt(BLOCK)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("phi", [0.5, 0.99])
 def test_coloured_noise_is_ar1_across_blocks(phi) -> None:
     sensor = SensorParameters(coloured_noise_mps2=0.1, coloured_phi=phi)
@@ -137,7 +137,7 @@ def test_rotation_is_one() -> None:
     assert rotation(np.array([0.0, 0.0, 1.0]), np.pi / 2) @ [1, 0, 0] == pytest.approx([0, 1, 0], abs=1e-14)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("seed", range(8))
 def test_presets_are_what_they_say(seed) -> None:
     simple, hard = plain(seed), faulty(seed)

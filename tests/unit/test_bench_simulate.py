@@ -47,7 +47,7 @@ def running(*arguments: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_files_hold_the_recording_and_its_truth(preset, tmp_path, capsys) -> None:
     directory = tmp_path / "example"
@@ -76,7 +76,7 @@ def test_files_hold_the_recording_and_its_truth(preset, tmp_path, capsys) -> Non
     assert truth["rate_hz"] == pytest.approx(1013.0 if preset == "faulty" else 1003.3)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_three_repetitions_by_default_and_no_pose_in_a_short_one(tmp_path) -> None:
     assert run_cli(["simulate", "--preset", "plain", "--csv", str(tmp_path)]) == 0
     poses = np.loadtxt(tmp_path / "poses.csv", delimiter=",", skiprows=1)

@@ -61,7 +61,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, key: tuple[Path, Ed25519Priva
     return out
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_numbers_survive_json_and_xml(made: Path) -> None:
     told = uneven()
     truth = np.append(np.ravel(told["sensitivity"]), told["offset"])
@@ -181,7 +181,7 @@ def test_the_pdf_has_two_pages_and_is_the_same_each_time(
         assert (out / path.name).read_bytes() == path.read_bytes(), path.name
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_texts_from_outside_are_shown_and_do_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     hostile = '<script>alert(1)</script> & $x$ "q" ]]>'
     told = fields(identity=f"{hostile}\x1b[2J\ufffe", method="3 (adjustment)")
@@ -198,7 +198,7 @@ def test_texts_from_outside_are_shown_and_do_nothing(tmp_path: Path, capsys: pyt
     assert not (out / "certificate.sig").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_data_directory_and_a_recording(tmp_path: Path) -> None:
     record(tmp_path / "data", 41.0)
     told = stated(tmp_path, decision="")
@@ -246,7 +246,7 @@ def test_the_graph_leads_from_the_certificate_to_the_files_and_the_reference(tmp
     assert sources[reference] == {"fieldcal:certificate/Accredited Laboratory/2026-0815"}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_is_not_known_is_left_out(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """S_xy and Q are null: the DCC has the other eight parameters with their covariance, and so has the prior."""
     told = uneven()

@@ -109,7 +109,7 @@ def test_questions_are_asked_on_a_terminal(tmp_path: Path, result: Path) -> None
     assert tomllib.loads((tmp_path / "out" / "certificate.toml").read_text())["customer"]["name"] == "Tower Operator"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_led_session_ends_with_the_certificate(tmp_path: Path) -> None:
     assert run_cli(["simulate", "--preset", "plain", "--csv", str(tmp_path)]) == 0
     options = calibrate_options([f"--{name}={tmp_path / name}.csv" for name in ("sensor", "reference", "poses")])

@@ -77,7 +77,7 @@ def test_openssl_verifies_it_and_notices_every_change(site: Path) -> None:
     assert run(site, *verify, "other.pem") != 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_command_writes_it_beside_the_files(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib", reason="the PDF needs the extra `report`")
     (site / "result.json").write_text(json.dumps(uneven()))

@@ -45,7 +45,7 @@ def beside(offset_s: float, ppm: float = 0.0, bands: str = "broad", other: int |
     return calibrate((sensor_s * (1.0 + 1e-6 * ppm) + offset_s, V), (reference_s, a), rotation=np.eye(3))
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("offset_s", "ppm", "bands"), [(1.7, 30.0, "broad"), (-6.3, 0.0, "broad"), (2.9, -100.0, "two modes")]
 )
@@ -101,7 +101,7 @@ def test_beyond_the_furthest_offset_nothing_is_told() -> None:
     assert clock_offset(stretches(FURTHEST_S + 2.0, "broad", 1), SECONDS, 2e-4, 0.02) is None
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("bands", BANDS_HZ)
 def test_pieces_of_another_motion_do_not_agree(bands: str) -> None:
     for other in range(2, 22):

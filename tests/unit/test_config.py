@@ -124,7 +124,7 @@ def test_a_file_that_is_none_is_a_fault(tmp_path: Path, content: bytes | None) -
     assert all(line.startswith(f"{path}: ") for line in caught.value.faults)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("text", "said"),
     [

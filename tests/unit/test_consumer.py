@@ -281,7 +281,7 @@ print("ended")
 """
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("what", ["iterate", "leave"])
 def test_a_consumer_ends_without_a_traceback(site: Site, what: str) -> None:
     command = [sys.executable, "-c", CONSUMING, site.endpoint, what]

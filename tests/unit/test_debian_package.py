@@ -88,7 +88,7 @@ def test_what_it_depends_on(package: Path) -> None:
     assert int(fields["Installed-Size"]) > 1000
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_is_in_it(package: Path, tmp_path: Path) -> None:
     asked("-x", package, tmp_path)
     for place, source in {

@@ -22,7 +22,7 @@ EXAMPLE = re.compile(r"^```python\n(.*?)^```\n(?:```text\n(.*?)^```\n)?", re.MUL
 OBJECTS = [name for name in calib.__all__ if name != "PARAMETERS"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_examples_print_what_the_page_says() -> None:
     examples = EXAMPLE.findall(PAGE)
     assert len(examples) > 6

@@ -28,7 +28,7 @@ def made() -> dict[str, str]:
     return cast("dict[str, str]", json.loads(run.stdout))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_reference_is_that_of_the_code(made: dict[str, str]) -> None:
     assert {path.name for path in pages.HERE.glob("*.md")} == set(made)
     stale = [name for name, text in made.items() if (pages.HERE / name).read_text("utf-8") != text]
@@ -49,7 +49,7 @@ def test_the_picture_is_that_of_the_code() -> None:
     assert s_q_u.DRAWING.read_text("utf-8") == s_q_u.drawing(), remedy
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_budget_is_of_this_version() -> None:
     """Two digits are shown, so that the last one may differ by one on another CPU."""
     shown = worked_budget.PAGE.read_text("utf-8").partition(worked_budget.BEGIN)[2].partition(worked_budget.END)[0]

@@ -79,7 +79,7 @@ def test_what_drivers_state_counts_as_if_the_configuration_stated_it(*, backward
     assert not same(calibrations(config, events({})), by_configuration)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_configuration_comes_before_the_driver() -> None:
     config = stating(drawn().config, prior=NEAR_TEXT, certificate=["flat"])
     other: dict[str, tuple[str, ...]] = {"sensor": ("lowpass corner_hz=40",), "reference": ("lowpass corner_hz=30",)}
@@ -223,7 +223,7 @@ def restarted(before: Building, after: Building) -> tuple[list[bool], list[str],
     return [report.used for report in gateway.reports[windows:]], gateway.reasons[told:], gateway.status
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_another_output_data_rate_at_the_next_start_is_another_filter_and_no_drift() -> None:
     used, told, status = restarted(Chip(62.5), Chip(125.0))
     assert told[0] == f"restored from the previous run; {OTHER_FILTERS}"
@@ -231,7 +231,7 @@ def test_another_output_data_rate_at_the_next_start_is_another_filter_and_no_dri
     assert status == "VALID"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_same_rate_at_the_next_start_is_the_same_filter_also_while_the_reference_is_not_open_yet() -> None:
     used, told, status = restarted(Chip(62.5), Chip(62.5))
     assert told[0] == "restored from the previous run"
@@ -240,7 +240,7 @@ def test_the_same_rate_at_the_next_start_is_the_same_filter_also_while_the_refer
     assert status == "VALID"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_device_with_another_setting_that_is_no_filter_is_another_device() -> None:
     _, told, _ = restarted(Chip(62.5, told=False), Chip(125.0, told=False))
     assert told[0].startswith("the stored calibration belongs to")

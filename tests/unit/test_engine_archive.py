@@ -84,7 +84,7 @@ def made(target: Path, given: dict[str, Path], capsys: pytest.CaptureFixture[str
     return status, told.out + told.err
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_archive_holds_all_and_audits_by_sh_alone(
     tmp_path: Path, given: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,7 +54,7 @@ def truth() -> tuple[np.ndarray, np.ndarray]:
     return made.sensor_time_s[:count] + EPOCH_NS * 1e-9, np.asarray(made.v[:count], dtype=float)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
 def test_a_table_has_times_indications_and_accelerations(
     ending: str, recorded: Path, truth: tuple[np.ndarray, np.ndarray], tmp_path: Path,

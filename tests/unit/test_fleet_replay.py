@@ -179,7 +179,7 @@ def run_or_end(task: RecordingTask) -> bytes:
     return run_task(task)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_file_that_ends_its_process_is_refused_alone(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

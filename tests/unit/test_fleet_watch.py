@@ -161,7 +161,7 @@ def test_nulls_other_grids_and_sensors_that_come_and_go(tmp_path: Path, clean: l
     assert "no sensor stands beside a reference" in told.output
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     rows = [dict(row) for row in clean]
     for row in rows:
@@ -172,7 +172,7 @@ def test_another_calibration_begins_the_norm_anew(tmp_path: Path, clean: list[di
     assert "learning" in next(line for line in told.output.splitlines() if line.startswith("middle/c"))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_users_meet(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     """From some day on at one sensor: x and y exchanged, twice the sensitivity, dead outputs; wrong units at a gateway;
     lines of another site among the others."""

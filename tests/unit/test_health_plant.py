@@ -121,6 +121,7 @@ def test_without_a_file_to_be_had_it_goes_on(alone: ProcessPoolExecutor, tmp_pat
     assert situation.publication.unpublished is None
 
 
+@pytest.mark.thorough
 def test_a_run_without_network_or_recording_is_told_so(tmp_path: Path, store: Store) -> None:
     recorder = SimpleNamespace(path=None, size_bytes=0, fault="No space left on device", space="")
     situation = plant(tmp_path, store, recorder=recorder, publisher=None).situation()

@@ -43,7 +43,7 @@ class Machine:
         self.t_s += seconds + late_s
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("driver", "twin", "options", "rate_error", "bias_us", "sd_us", "largest_us"),
     [

@@ -48,7 +48,7 @@ def gateway(site: Site, tmp_path: Path) -> Iterator[Publisher]:
     store.close()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway: Publisher, tmp_path: Path) -> None:
     monitor = Monitor(site.endpoint, tmp_path / "monitor")
     try:
@@ -70,7 +70,7 @@ def test_a_sensor_is_shown_with_why_and_kept_over_a_restart(site: Site, gateway:
         monitor.stop(signal.SIGTERM)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_hours_of_the_bus_are_kept_and_read_while_the_monitor_runs(site: Site, tmp_path: Path) -> None:
     """From a gateway's store over the bus into the database; `fieldcal fleet watch` reads it meanwhile."""
     rows = [row for row in lines()[: 6 * 24] if row["sensor"] == "c"]
@@ -122,7 +122,7 @@ def test_a_drift_stays_one_over_a_restart(site: Site, tmp_path: Path) -> None:
         assert len(served.fleet.events()) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(tmp_path: Path) -> None:
     """While no router answers: Ctrl-C ends the monitor well all the same.
 

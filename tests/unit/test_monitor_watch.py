@@ -109,7 +109,7 @@ def test_the_frequency_of_a_day_is_in_its_sum_and_earlier_sums_have_none(rows: l
     assert len(sums[1].frequency) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_monitor_says_what_the_files_say_and_what_it_said_lasts(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     file = tmp_path / "hours.jsonl"
     file.write_text("\n".join(map(json.dumps, rows)) + "\n")
@@ -225,6 +225,7 @@ def test_late_hours_make_their_day_anew(engine: DatabaseEngine, rows: list[dict[
     assert [sensor for _, sensor in whole.sensors] == list("abcdef")
 
 
+@pytest.mark.one_case
 def test_hours_are_kept_for_90_days_and_days_for_ever(engine: DatabaseEngine, rows: list[dict[str, Any]]) -> None:
     first = FIRST_H // 24
     now_ns = (FIRST_H + 24 * 200) * HOUR_NS

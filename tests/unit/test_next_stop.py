@@ -158,7 +158,7 @@ def test_what_is_wanted_is_the_only_measure():
     assert not WantedUncertainty(5e-4, 1.0).reached(np.where(MAIN, 6e-4, 0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_first_stop_that_was_wrong_is_found_by_the_later_ones():
     """A turn of 15 deg at the first stop, where S is not known yet, looks possible; a later stop finds it by name."""
     user, session = User.drawn(0, OFFSET_MPS2), _session(TWO, STATED)

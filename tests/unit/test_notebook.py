@@ -112,7 +112,7 @@ def pair(columns: Columns) -> tuple[Any, Any]:
     return time_s, np.column_stack(values) if len(values) > 1 else values[0]
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("form", [frame, structured, pair, lambda columns: np.column_stack(list(columns.values()))])
 def test_every_kind_of_table_gives_the_same(result: Outcome, form: Callable[[Columns], Any]) -> None:
     poses = frame(POSES) if form is frame else POSES
@@ -183,7 +183,7 @@ def test_dates_are_times(result: Outcome) -> None:
     np.testing.assert_allclose(found.values, result.values, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_earlier_result_is_a_prior_in_any_of_its_forms(result: Outcome) -> None:
     forms = [result, result.calibration, json.loads(result.to_json())]
     assert isinstance(forms[1], Calibration)

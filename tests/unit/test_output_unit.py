@@ -169,7 +169,7 @@ def test_an_output_in_g_is_shown_in_g_per_g_and_mg(
     np.testing.assert_array_equal(read_earlier(tmp_path / "earlier.xml")[0][:9], np.ravel(told["sensitivity"]))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_reference_of_velocity_is_a_vibrometer(tmp_path: Path) -> None:
     t, a = REFERENCE["time_s"], REFERENCE["a"]
     velocity = {"time_s": t, "v": np.concatenate([[0.0], np.cumsum(0.5 * (a[1:] + a[:-1]) * np.diff(t))])}
@@ -191,7 +191,7 @@ def test_a_reference_of_acceleration_is_an_accelerometer(tmp_path: Path) -> None
     assert reference_of(certificate(tmp_path, result, output_unit="")).startswith("reference accelerometer: PCB ")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_warning_is_told_once_wherever_the_result_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """All outputs of the sensor have the wrong sign: S is valid, and negative."""
     given = files(tmp_path, ("X [mV]", "Y [mV]", "Z [mV]"), -1.0)

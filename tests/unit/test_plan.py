@@ -91,7 +91,7 @@ def place(served: Served, headers: dict[str, str], told: object) -> Answer:
     return served.ask("/api/plan/position", "POST", json.dumps(told), headers)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_user_with_the_right_puts_a_picture_and_sensors(served: Served) -> None:
     anna = session(served, "anna")
     assert served.ask("/plan", headers=anna).status == 404

@@ -109,7 +109,7 @@ def test_six_sides_by_a_closed_formula() -> None:
     assert plan.enough
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_proposed_positions_are_enough_and_fewer_are_not() -> None:
     """For clamps of any inclination with one or two positions, as many positions as determine all twelve."""
     random = np.random.default_rng(5)

@@ -85,7 +85,7 @@ def test_the_same_s_and_q_from_every_format(line: str, site: Path, capsys: pytes
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-9, atol=1e-9 * 26000)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("line", [line for line in COMMANDS if "run.mcap" in line or ".wav" in line])
 def test_commands_with_files_of_one_rate(line: str, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if ".wav" in line:

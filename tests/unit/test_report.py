@@ -156,7 +156,7 @@ def test_a_recording_gives_the_same_calibration_and_a_torn_one_what_it_has(
     assert "ends early" in Page(tmp_path / "torn" / "report.html").text
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_recording_without_a_calibration_says_why_and_is_status_3(
     recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

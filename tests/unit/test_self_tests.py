@@ -170,7 +170,7 @@ def test_a_range_that_gravity_and_the_self_test_do_not_fit_is_left_for_the_self_
     assert np.ptp(opened) < 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_moves_too_much_is_told_and_nothing_is_stopped() -> None:
     bus = Bus()
     bus.shaken_g = lambda t: 0.02 * np.sin(2 * np.pi * 3.0 * t)
@@ -188,7 +188,7 @@ def test_what_moves_too_much_is_told_and_nothing_is_stopped() -> None:
     assert np.isnan(told.response_mps2).all()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_it_waits_until_little_moves() -> None:
     bus = Bus()
     bus.shaken_g = lambda t: np.where(t < 40.0, 0.05 * np.sin(2 * np.pi * 3.0 * t), 0.0)
@@ -260,7 +260,7 @@ def recorded() -> list[Event]:
     return sorted([*whole, *ticks], key=lambda event: event.t_monotonic_ns)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_replay_gives_the_same_and_the_sensor_does_not_become_silent(recorded: list[Event]) -> None:
     plan = {"at": "03:00", "u_supply_pct": 0.25}
     pipeline = Pipeline.begin(config(self_test=plan), "run", 0, 0, {})

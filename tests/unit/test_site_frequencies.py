@@ -91,7 +91,7 @@ def test_a_frequency_that_falls_at_all_sensors_is_the_structure(band: int) -> No
     assert not found.gateways
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_sound_frequencies_follow_the_temperature_and_are_not_told() -> None:
     assert [len(after(40, seed=seed).frequencies) for seed in range(2)] == [0, 0]
 
@@ -101,7 +101,7 @@ def test_what_one_sensor_sees_alone_is_not_the_structure() -> None:
     assert not after(20, in_window(2, 0.05, slice(0, 2))).frequencies
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("see", [2, 3])
 def test_a_frequency_that_fewer_than_three_sensors_see_is_not_told(see: int) -> None:
     site, watch = Frequencies(8), SiteWatch(GATEWAY, BANDS_HZ)
@@ -156,7 +156,7 @@ def test_a_visit_does_not_touch_frequencies() -> None:
     assert len(result(watch).frequencies) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_days_of_results_without_frequencies_are_silent_on_them() -> None:
     site, watch = Frequencies(4), SiteWatch(GATEWAY, BANDS_HZ)
     for k in range(80):

@@ -177,7 +177,7 @@ def test_a_gateway_is_told_as_the_gateway(learned: tuple[Site, SiteWatch]) -> No
     assert abs(found.gateways[1].size + 0.01) < found.gateways[1].U
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_of_two_gateways_it_is_not_told_which_and_of_one_nothing_is_seen() -> None:
     for gateway, told in ((GATEWAY // 2, [0]), (0 * GATEWAY, [])):
         site = Site(6, gateway)
@@ -189,7 +189,7 @@ def test_of_two_gateways_it_is_not_told_which_and_of_one_nothing_is_seen() -> No
         assert kinds(found) == {}
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("gateway", [[0, 0], [0, 1]])
 def test_of_two_sensors_it_is_not_told_which_one_has_changed(gateway: list[int]) -> None:
     """Both verdicts are of one size with opposite signs; nothing is told of two that stay; a turn is of one sensor."""
@@ -210,7 +210,7 @@ def test_of_two_sensors_it_is_not_told_which_one_has_changed(gateway: list[int])
     assert kinds(turn) == {1: "turn"}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_false_alarms_of_two_sensors_are_those_of_one_comparison() -> None:
     """The statistic of two sound sensors is a standard normal deviate, or less: over 16 sites its root mean square is
     at most 1.1. Were the scatter of their difference taken for half of it, as the level would have it, it were 1.28."""
@@ -465,7 +465,7 @@ def test_a_clock_that_is_hours_off_is_told_and_its_hours_do_not_count() -> None:
         assert np.isnan(day.value).all(axis=(1, 2)).tolist() == [i in late for i in range(9)]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_gateway_whose_clock_is_an_hour_off_is_told_as_its_clock() -> None:
     """For 12 days, then its clock is set: nothing else is told of it, and nothing of the others."""
     random, watch = np.random.default_rng(11), SiteWatch(GATEWAY, BANDS_HZ)

@@ -30,7 +30,7 @@ def test_bands_are_third_octaves_of_the_standard_within_their_limits() -> None:
     assert len(bands_of(0.2).centre_hz) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_power_and_cross_power_of_white_noise() -> None:
     """60 hours of 60 segments, seed 1: each number within 5 standard errors and the 3 % of the median's share."""
     bands, rng = bands_of(RATE_HZ), np.random.default_rng(1)

@@ -155,7 +155,7 @@ def test_the_way_is_found_within_two_frames(changes: dict[str, Any], kind: str) 
         assert set(lost) <= set(range(before, 20 + behind))
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("kind", ["cut", "lost", "added", "flipped"])
 @pytest.mark.parametrize("name", ["sum16", "fletcher16"])
 def test_a_checksum_lets_no_damaged_frame_through(name: str, kind: str) -> None:

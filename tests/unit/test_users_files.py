@@ -90,7 +90,7 @@ TIMES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", TIMES)
 def test_times_as_programs_write_them(name: str, tmp_path: Path) -> None:
     of_sensor, of_reference = TIMES[name]
@@ -142,7 +142,7 @@ COLUMNS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("name", COLUMNS)
 def test_east_north_and_up_are_x_y_and_z(name: str, tmp_path: Path) -> None:
     """In the order of the file they would be a left-handed frame."""
