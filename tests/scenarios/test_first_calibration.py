@@ -23,7 +23,7 @@ ABSENCE = absence()
 STATED = [f"--state={name}={value}" for name, value in entries().items() if not name.startswith("decision")]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_from_plugged_devices_to_a_report(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="the figures need the extra `report`")
     config, data_dir, bench = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "bench"
