@@ -173,10 +173,11 @@ def reasons() -> Iterator[str]:
         "Refused and held windows",
         "find what the reason of a refused or held window means, and what to do",
         "Every reason that a running agent gives for a window that it does not use: in the log, on the terminal, on "
-        "the fleet page, in `reason` of the result `window`, and, after three refused windows in a row, in the "
-        "status. `#` stands for a number or a name. The line `next:` says what stands under *do*. Settings are those "
-        "of `[[channels]]` ([configuration.md](configuration.md)); the [numbers](messages.md#result-window) of the "
-        "window have each statistic beside its limit.",
+        "the fleet page, and in `reason` of the result `window`; the status says once the reason of the third window "
+        "that was refused in a row, and that of each fault of the program. `#` stands for a number or a name. The line "
+        "`next:` says what stands under *do*. Settings are those of `[[channels]]` "
+        "([configuration.md](configuration.md)); the [numbers](messages.md#result-window) of the window have each "
+        "statistic beside its limit.",
     )
     yield from _paragraph(
         "A refused window changes nothing, and the agent goes on with the next one: a few are normal. A window meets "
@@ -263,7 +264,7 @@ def _head(title: str, after: str, text: str) -> list[str]:
 
 
 def _paragraph(text: str) -> list[str]:
-    return [*textwrap.wrap(text, WIDTH + 20), ""]
+    return [*textwrap.wrap(text, WIDTH + 20, break_on_hyphens=False), ""]  # a link is not broken
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
