@@ -175,7 +175,8 @@ SAMPLES = Stage(
         WindowReason(
             ("{} % of the samples of {} are missing",),
             "more samples are missing than can be filled",
-            "find what loses samples: `fieldcal doctor` looks at the line, the bus and the load of this computer",
+            "find what loses samples: a line or bus that is too slow, a loose cable, or a busy computer; "
+            "`fieldcal doctor --measure 5` measures each device",
             ("late_horizon_s",),
         ),
         WindowReason(

@@ -148,7 +148,7 @@ def test_a_fault_of_a_driver_is_no_matter_of_cables() -> None:
         ("the sensor does not follow the reference: coherence 0.400, 0.5 needed", "fasten sensor and reference"),
         ("the sensor's mean changes by 0.4 m/s2 within the window, 0.2 m/s2 at most", "hands and cables off"),
         ("9.0 % of the points are knocks, 5 % at most", "keep knocks away"),
-        ("7.1 % of the samples of mems are missing, 5 % at most", "`fieldcal doctor`"),
+        ("7.1 % of the samples of mems are missing, 5 % at most", "`fieldcal doctor --measure 5`"),
         ("the sensor stands at none of the stated positions: the nearest is a, with chi-squared 90, the limit is 21",
          "turn the sensor to a stated position"),
         ("a reason of a later version", "mend what the reason of the newest windows names"),
