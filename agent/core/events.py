@@ -162,7 +162,7 @@ class WindowReport(Result, frozen=True, kw_only=True):
     stop_s: float
     position: str
     used: bool
-    reason: str
+    reason: str  # why it is refused or held (docs/reference/reasons.md); "" where it is used
     points: int
     left_out: int
     numbers: dict[str, float]  # the statistics on which the verdict rests, each with its unit in its name

@@ -1,5 +1,7 @@
 """What the page says of each sensor and gateway now: the newest results, a kind, and why a person is needed.
 
+page/fleet.js shows it; the package agent/fleet is the command `fieldcal fleet`.
+
 The kind of a sensor follows from verdicts alone: of its agent on drift and status, and from whether it is heard. The
 largest of twelve changes tells nothing: of sound parameters one exceeds its U often enough.
 """
@@ -60,7 +62,9 @@ Kind = Literal[
     "drifting", "changed", "held", "doubled", "no data", "silent", "retired", "uncalibrated", "suspected", "sound"
 ]  # fmt: skip
 
-SHOWN = {"status", "calibration", "good window"}  # a sensor of which none is known, and no drift, has no row
+# A sensor of which none is known, and no drift, has no row. A good window is one that was used: neither a refused one
+# nor one that is held.
+SHOWN = {"status", "calibration", "good window"}
 
 Place = tuple[str, str, str]  # site, gateway, sensor
 

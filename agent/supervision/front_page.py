@@ -36,7 +36,7 @@ def _status(status: GatewayStatus) -> str:
         ),
     )
     sensors = _table(
-        ("sensor", "calibration", "windows used", "windows refused", "reason"),
+        ("sensor", "calibration", "windows used", "windows not used", "reason"),
         ((name, s.status, s.windows_used, s.windows_refused, s.reason) for name, s in status.sensors.items()),
     )
     return (

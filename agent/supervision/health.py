@@ -102,6 +102,7 @@ class InForce(msgspec.Struct, frozen=True, kw_only=True):
 
 class SensorHealth(msgspec.Struct, frozen=True, kw_only=True):
     """Results of one sensor since the run began. `calibrations` were made in this run: one restored is none of them.
+    `windows_refused` counts all windows that were not used, held ones among them.
 
     `drifts`: the newest verdict of the drift test on each parameter that it has judged, also in earlier runs.
     """

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agent.config import Channel, Config
+from agent.core.channel import REFUSED_IN_A_ROW
 from agent.core.events import (
     IN_DRIVER,
     CalibrationUpdate,
@@ -20,25 +21,13 @@ from agent.core.events import (
     StatusChange,
     WindowReport,
 )
+from agent.terminal.held import is_held
+from agent.terminal.window_reasons import AS_BEFORE, known
 from calib.geometry import AXES
 from calib.model import Pose
 
-REFUSED_IN_A_ROW = 3  # refused windows from which on the line says what can be done about them
 STAY_S = 20  # in each position: a window then has more than ten seconds between its guards
 UPRIGHT = 0.99  # share of gravity on one axis from which on this axis points up or down
-# A statistic of a refused window, the sign by which it exceeds its threshold, and what helps.
-REMEDIES = (
-    ("points", -1, "let the sensor stay longer in each position"),
-    ("reference_rms_mps2", -1, "wait for more motion, or make it: that of the reference is hardly above its noise"),
-    ("stuck_axes", 1, "look at the sensor: an axis always indicates the same value"),
-    ("clipped_points", 1, "make the motion smaller, or set a larger range: the sensor reaches the end of its range"),
-    ("coherence", -1, "fasten sensor and reference to the same part, and compare their axes with the configuration"),
-    ("drift_mps2", 1, "keep hands and cables off the sensor while it stands in a position, and let it warm up"),
-    ("step_mps2", 1, "keep hands and cables off the sensor while it stands in a position, and let it warm up"),
-    ("sd_over_floor", 1, "put the sensor where nothing moves it"),
-    ("nonlinearity_pct", 1, "fasten the sensor better: it slips or rattles where the motion is strong"),
-    ("left_out_pct", 1, "keep knocks away from the sensor"),
-)
 
 
 @dataclass
@@ -48,7 +37,7 @@ class SensorProgress:
     status: str = ""
     used: list[str] = field(default_factory=list)  # positions, each once
     newest: WindowReport | None = None
-    refused: int = 0  # windows in a row
+    refused: int = 0  # windows in a row; held ones are none
     estimate: int = 0
     on_hold: bool = False
 
@@ -60,7 +49,8 @@ class SensorProgress:
                 # A restart dismisses held windows, so that a run which begins with HELD was put on hold.
                 self.on_hold |= result.status == "HELD" and result.before == ""
             case WindowReport():
-                self.newest, self.refused = result, 0 if result.used else self.refused + 1
+                self.newest = result
+                self.refused = 0 if result.used or is_held(result) else self.refused + 1
                 if result.used and result.position not in self.used:
                     self.used.append(result.position)
             case Estimate():
@@ -120,7 +110,7 @@ class NextSteps:
             return self._accept(channel, seen.estimate)
         if seen.status == "HELD":
             return (
-                f"check that mount, sensor and reference are as before; {channel.gate.confirm_windows} windows that "
+                f"{AS_BEFORE}; {channel.gate.confirm_windows} windows that "
                 f"agree confirm a change, {channel.gate.dismiss_windows} that fit the calibration end HELD"
             )
         if channel.watched and not self._turns_itself:
@@ -170,11 +160,10 @@ class NextSteps:
 
 
 def _mend(seen: SensorProgress) -> str:
-    numbers = seen.newest.numbers if seen.newest else {}
-    for name, sign, remedy in REMEDIES:
-        if name in numbers and sign * (numbers[name] - numbers.get(f"{name}_threshold", numbers[name])) > 0:
-            return remedy
-    return "mend what the reason of the newest windows names: they are refused one after the other"
+    found = known(seen.newest.reason) if seen.newest else None
+    return (
+        found.do if found else "mend what the reason of the newest windows names: they are refused one after the other"
+    )
 
 
 def _next_stated(channel: Channel, seen: SensorProgress) -> str | None:

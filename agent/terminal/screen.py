@@ -122,7 +122,7 @@ class ScreenPicture:
 
     def _windows(self, room: int) -> list[Text]:
         state = self._state
-        title = f"windows: {state.windows_used} used, {state.windows_refused} refused"
+        title = f"windows: {state.windows_used} used, {state.windows_held} held, {state.windows_refused} refused"
         lines = [Text(), Text(title, "dim")]
         for window in list(state.windows)[-max(0, room - len(lines)) :] if room > len(lines) else []:
             cells = (window.sensor, window.position, window_span(window), verdict(window))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowReport
+from agent.terminal.held import is_held
 from agent.terminal.text import one_line
 from calib.model import Array
 
@@ -54,6 +55,7 @@ class ViewState:
     devices: dict[str, DeviceState] = field(default_factory=dict)
     windows: deque[WindowReport] = field(default_factory=lambda: deque(maxlen=100))
     windows_used: int = 0
+    windows_held: int = 0
     windows_refused: int = 0
     calibrations: dict[str, CalibrationUpdate] = field(default_factory=dict)
     statuses: dict[str, StatusChange] = field(default_factory=dict)
@@ -71,7 +73,8 @@ class ViewState:
                 case WindowReport():
                     self.windows.append(result)
                     self.windows_used += result.used
-                    self.windows_refused += not result.used
+                    self.windows_held += is_held(result)
+                    self.windows_refused += not result.used and not is_held(result)
                 case CalibrationUpdate():
                     self.calibrations[result.sensor] = result
                 case StatusChange():

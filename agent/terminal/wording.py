@@ -21,6 +21,7 @@ from agent.core.events import (
     WatchReport,
     WindowReport,
 )
+from agent.terminal.held import is_held
 from agent.terminal.quantity import counted, size
 from calib.model import Array
 from calib.output_unit import shown_in
@@ -120,7 +121,9 @@ def gap_line(gap: Gap) -> str:
 def verdict(window: WindowReport) -> str:
     """Whether the window was used, with its number of points, or why not."""
     left_out = f", {window.left_out} left out" if window.left_out else ""
-    return f"used, {window.points} points{left_out}" if window.used else f"refused: {window.reason}"
+    if window.used:
+        return f"used, {window.points} points{left_out}"
+    return f"{'held' if is_held(window) else 'refused'}: {window.reason}"
 
 
 def window_span(window: WindowReport) -> str:

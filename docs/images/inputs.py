@@ -27,8 +27,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
     ),
     "fleet": (
         "tests/scenarios/fleet_page.py", "agent/fleet/simulated_sensor.py", "agent/fleet/simulated_channel.py",
-        "agent/monitor/trends.py", "agent/monitor/onset.py", f"{PAGE}/index.html", f"{PAGE}/page.css",
-        f"{PAGE}/fleet.js", f"{PAGE}/sensor.js",
+        "agent/monitor/fleet.py", "agent/monitor/trends.py", "agent/monitor/onset.py", f"{PAGE}/index.html",
+        f"{PAGE}/page.css", f"{PAGE}/fleet.js", f"{PAGE}/sensor.js",
     ),
     "bench": ("tests/scenarios/bench_page.py", f"{PAGE}/page.css", f"{PAGE}/bench.js"),
     "report": (

@@ -1,4 +1,4 @@
-"""The reference pages, made from the code: configuration, drivers, commands, messages, `import calib`.
+"""The reference pages, made from the code: configuration, drivers, commands, messages, reasons, `import calib`.
 
 `.venv/bin/python -m docs.reference.pages` writes them; `tests/unit/test_docs_site.py` fails when one is stale.
 """
@@ -11,11 +11,16 @@ import re
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import msgspec
 from pydantic import BaseModel
+
+from docs.reference.window_numbers import NUMBERS, THRESHOLD
+
+if TYPE_CHECKING:
+    from agent.terminal.window_reasons import Stage
 
 HERE = Path(__file__).parent
 WIDTH = 100
@@ -27,7 +32,7 @@ UNITS = {
 
 def written() -> dict[str, str]:
     """All pages by their file name."""
-    makers = (configuration, drivers, commands, messages, python)
+    makers = (configuration, drivers, commands, messages, reasons, python)
     return {f"{maker.__name__}.md": "\n".join(maker()).rstrip() + "\n" for maker in makers}
 
 
@@ -123,6 +128,8 @@ def messages() -> Iterator[str]:
     own = set(common.__struct_fields__)
     for what, kind in sorted(events.RESULTS.items()):
         yield from [f"## Result `{what}`", "", _flat(kind.__doc__), "", *_fields(kind, own)]
+        if kind is events.WindowReport:
+            yield from _numbers()
     for kind in (events.BandResponse, events.SteadySensitivity, events.SharedError):
         yield from [f"## Part `{kind.__name__}`", "", _flat(kind.__doc__), "", *_fields(kind, set())]
     for kind in (
@@ -145,6 +152,69 @@ def messages() -> Iterator[str]:
     parts = (guide.Expanded, guide.NextStop, guide.Staying, guide.TakenStop, guide.Warned, guide.Ending, guide.MadeFile)
     for kind in parts:
         yield from [f"## Part `{kind.__name__}`", "", _flat(kind.__doc__), "", *_fields(kind, set())]
+
+
+def _numbers() -> Iterator[str]:
+    """What stands in the `numbers` of a window."""
+    yield from [
+        f"`numbers` has those of these names that apply; a name with `{THRESHOLD}` at its end is the limit of the "
+        "statistic, and one that begins with `u_` its standard uncertainty.",
+        "",
+    ]
+    rows = [(f"`{names.replace(', ', '`, `')}`", _unit(names), meaning) for names, meaning in NUMBERS.items()]
+    yield from _table(("name", "unit", "meaning"), rows)
+
+
+def reasons() -> Iterator[str]:
+    """Why windows are refused or held, and what helps."""
+    from agent.terminal.window_reasons import HELD, REFUSED
+
+    yield from _head(
+        "Refused and held windows",
+        "find what the reason of a refused or held window means, and what to do",
+        "Every reason that a running agent gives for a window that it does not use: in the log, on the terminal, on "
+        "the fleet page, and in `reason` of the result `window`; the status says once the reason of the third window "
+        "that was refused in a row, and that of each fault of the program. `#` stands for a number or a name. The line "
+        "`next:` says what stands under *do*. Settings are those of `[[channels]]` "
+        "([configuration.md](configuration.md)); the [numbers](messages.md#result-window) of the window have each "
+        "statistic beside its limit.",
+    )
+    yield from _paragraph(
+        "A refused window changes nothing, and the agent goes on with the next one: a few are normal. A window meets "
+        "the reasons from top to bottom, and the first one that applies is told. A fault of the program can come "
+        "anywhere. A lag that would explain the window is told behind the reason."
+    )
+    yield from ["## Refused windows", ""]
+    for stage in REFUSED:
+        yield from [f"### {stage.title}", "", *_remedies(stage)]
+    yield from ["## Held windows", ""]
+    yield from _paragraph(
+        "A window that is held is kept aside until further windows confirm it, and the status is HELD. Its reason has "
+        "several parts, with a semicolon between them. [online.md](../online.md#the-gate) has the rules, and what the "
+        "status says when HELD does not end."
+    )
+    yield from _remedies(HELD)
+
+
+def _remedies(stage: Stage) -> Iterator[str]:
+    rows = [
+        (
+            "<br>".join(_sentence(s) for s in one.sentences),
+            _capital(one.means),
+            _capital(one.do),
+            ", ".join(f"`{setting}`" for setting in one.settings),
+        )
+        for one in stage.reasons
+    ]
+    yield from _table(("reason, or its beginning", "means", "do", "settings"), rows)
+
+
+def _sentence(pattern: str) -> str:
+    return f"*{pattern.partition('; ')[0].replace('{}', '#')}*"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _fields(kind: type[msgspec.Struct], left_out: set[str]) -> Iterator[str]:
@@ -190,7 +260,11 @@ def _signature(name: str, found: Any) -> str:
 def _head(title: str, after: str, text: str) -> list[str]:
     """Title, what the reader can do after the page, and an introduction."""
     made = "<!-- made from the code by `python -m docs.reference.pages`; do not edit -->"
-    return [f"# {title}", "", f"After this page you can {after}.", "", made, "", *textwrap.wrap(text, WIDTH + 20), ""]
+    return [f"# {title}", "", f"After this page you can {after}.", "", made, "", *_paragraph(text)]
+
+
+def _paragraph(text: str) -> list[str]:
+    return [*textwrap.wrap(text, WIDTH + 20, break_on_hyphens=False), ""]  # a link is not broken
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:

@@ -16,7 +16,7 @@ from agent.core.events import DriftReport, Result
 from agent.delivery.keys import Address
 from agent.delivery.received import Received
 from tests.unit.browser import Watched, chromium, needs_chromium
-from tests.unit.results import calibration, status
+from tests.unit.results import calibration, status, window
 from tests.unit.test_docs_commands import unknown
 from tests.unit.zenoh_site import Site
 
@@ -85,6 +85,11 @@ HIDE = """() => {
     document.dispatchEvent(new Event('visibilitychange'));
 }"""
 SHOW = "() => { delete document.hidden; document.dispatchEvent(new Event('visibilitychange')); }"
+# Of the table of all sensors: what a desk shows, what of it a narrower window does not, and the heads on a phone.
+COLUMNS = {"name", "x", "y", "z", "change", "over", "u", "band", "good", "reference"}
+BESIDE, CURVES = {"band", "reference"}, {"name", "x", "y", "z"}
+SHOWN_COLUMNS = """row => [...document.querySelector(row).children]
+    .filter((cell) => getComputedStyle(cell).display !== 'none').map((cell) => cell.dataset.column)"""
 TABS = 8  # a browser has six connections to one server
 CONTRADICT = "6 held windows contradict the state: chi-squared 5094, 141 at most if it is right. "
 BY_REFERENCE = (
@@ -260,6 +265,29 @@ def test_a_change_that_is_not_in_force_is_said_so_and_each_word_is_explained(
             page.set_viewport_size({"width": width, "height": 900})
             assert page.locator("#words").evaluate("w => w.scrollWidth <= w.clientWidth"), width
             assert axe_faults(page) == []
+        watched.close()
+
+
+def test_columns_by_the_width_of_the_window_and_windows_by_their_verdict(
+    site: Site, tmp_path: Path, browser: Any
+) -> None:
+    held, refused = window(2, used=False, reason="the window contradicts the calibration"), window(3, used=False)
+    held.numbers["innovation_chi2"] = 900.0
+    with Served(site, tmp_path / "monitor") as served:
+        keep(served, "mems", window(1), held, refused, calibration(4), status(5))
+        watched = Watched(browser, served.address, viewport={"width": 1440, "height": 900})
+        page = watched.open()
+        page.locator("#groups .row").wait_for()
+        for width, heads, cells in (
+            (1440, COLUMNS, COLUMNS), (820, COLUMNS - BESIDE, COLUMNS - BESIDE), (390, CURVES, COLUMNS - BESIDE),
+        ):  # fmt: skip
+            page.set_viewport_size({"width": width, "height": 900})
+            assert set(page.evaluate(SHOWN_COLUMNS, "#heads")) == heads, width
+            assert set(page.evaluate(SHOWN_COLUMNS, "#groups .row")) == cells, width
+        watched.open("#site=site&gateway=gw&sensor=mems")
+        rows = page.get_by_role("table", name="Windows", exact=True).locator("tr td:nth-child(3)")
+        page.locator("summary", has_text="Windows").click()
+        assert rows.all_inner_texts() == ["refused", "held", "used"]
         watched.close()
 
 

@@ -12,6 +12,7 @@ import pytest
 from agent.proto import fieldcal_pb2 as pb
 from agent.recording.raw_block import encode_block
 from agent.recording.reading import RecordingReader
+from docs import worked_block
 from hw.block import SampleBlock
 from tests.replay.golden_files import GOLDEN
 from tests.unit.recorded_bench import record
@@ -109,3 +110,39 @@ def test_s_by_plain_least_squares_is_the_published_one(
 def test_a_wrong_answer_is_outside(right: str, wrong: str, recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert right in CODE
     assert off_by(CODE.replace(right, wrong), monkeypatch, recorded) > 1.5
+
+
+def test_the_worked_block_is_of_the_code_and_any_reader_has_its_samples() -> None:
+    text = PAGE.read_text("utf-8")
+    assert worked_block.page() == text, "run `.venv/bin/python -m docs.worked_block` and commit what it writes"
+    shown = text.partition(worked_block.BEGIN)[2].partition(worked_block.END)[0]
+    data = bytes.fromhex("".join(re.findall(r"^((?:[0-9a-f]{2} )*[0-9a-f]{2})(?: |$)", shown, re.MULTILINE)))
+    message, names = pb.RawBlock.FromString(data), run(READER)
+    said = re.findall(r"\((-?\d+), (-?\d+), (-?\d+)\)", text.partition("A block of three samples")[2])[:3]
+    assert names["samples"](message).tolist() == [[int(value) for value in sample] for sample in said]
+    arrival_ns, count = names["bursts"](message)
+    assert (arrival_ns.tolist(), count.tolist()) == ([5 * 10**9, 5 * 10**9 + 10**7], [2, 3])
+    assert (message.order, len(message.differences)) == (1, 2 * 3 * 2)
+
+
+def test_the_table_of_a_block_has_each_field_with_its_number_and_type() -> None:
+    table = PAGE.read_text("utf-8").partition("## The bytes of a block")[2].partition("**The width")[0]
+    told: dict[int, tuple[str, str]] = {}
+    for numbers, names, kind in re.findall(r"^\| ([\d to]+) \| ([`\w, ]+) \| ([\w ]+) \|", table, re.MULTILINE):
+        first = int(numbers.partition(" ")[0])
+        told |= {first + k: (name, kind) for k, name in enumerate(re.findall(r"`(\w+)`", names))}
+    fields = {field.number: field for field in pb.RawBlock.DESCRIPTOR.fields}
+    assert told == {number: (field.name, kind_of(field)) for number, field in fields.items()}
+
+
+def test_the_fast_form_of_a_block_has_the_same_fields() -> None:
+    """RawBlockBytes has byte strings in the place of packed arrays, and else what RawBlock has."""
+    plain = [(f.number, f.name, kind_of(f)) for f in pb.RawBlock.DESCRIPTOR.fields]
+    fast = [(f.number, f.name, kind_of(f)) for f in pb.RawBlockBytes.DESCRIPTOR.fields]
+    assert fast == [(number, name, "bytes" if kind.startswith("packed") else kind) for number, name, kind in plain]
+
+
+def kind_of(field: Any) -> str:
+    kind = {getattr(field, name): name.removeprefix("TYPE_").lower() for name in dir(field) if name.startswith("TYPE_")}
+    optional = field.containing_oneof is not None  # proto3 makes an oneof of each optional field
+    return ("packed " if field.is_repeated else "optional " if optional else "") + kind[field.type]

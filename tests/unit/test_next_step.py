@@ -44,10 +44,8 @@ def used(position: str, sequence: int = 1) -> Result:
     return msgspec.structs.replace(window(sequence), position=position)
 
 
-def refused(name: str, value: float, threshold: float) -> list[Result]:
-    numbers = {"points": 900.0, "points_threshold": 100.0, name: value, f"{name}_threshold": threshold}
-    one = msgspec.structs.replace(window(1, used=False, reason="so"), numbers=numbers)
-    return [one] * 3
+def refused(reason: str) -> list[Result]:
+    return [window(1, used=False, reason=reason)] * 3
 
 
 def command(verb: str, arguments: str = "{}", refused: str = "") -> Command:
@@ -141,30 +139,38 @@ def test_a_fault_of_a_driver_is_no_matter_of_cables() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "threshold", "words"),
+    ("reason", "words"),
     [
-        ("points", 10.0, 100.0, "stay longer"),
-        ("reference_rms_mps2", 0.01, 0.02, "more motion"),
-        ("stuck_axes", 1.0, 0.0, "always indicates the same value"),
-        ("clipped_points", 7.0, 0.0, "a larger range"),
-        ("coherence", 0.4, 0.9, "fasten sensor and reference"),
-        ("drift_mps2", 0.4, 0.1, "hands and cables off"),
-        ("step_mps2", 0.4, 0.1, "hands and cables off"),
-        ("sd_over_floor", 9.0, 3.0, "where nothing moves it"),
-        ("nonlinearity_pct", 9.0, 2.0, "fasten the sensor better"),
-        ("left_out_pct", 9.0, 5.0, "knocks"),
-        ("position_chi2", 900.0, 20.0, "mend what the reason of the newest windows names"),
+        ("too few points: 10, 30 needed", "stay longer"),
+        ("the reference is silent: 0.01 m/s2 rms in band, 0.02 m/s2 needed (its noise is 0.007 m/s2)", "more motion"),
+        ("dead: the output of 1 of the sensor's axes does not change at all", "always indicates the same value"),
+        ("clipped: 7 points at the end of the sensor's range", "a larger range"),
+        ("the sensor does not follow the reference: coherence 0.400, 0.5 needed", "fasten sensor and reference"),
+        ("the sensor's mean changes by 0.4 m/s2 within the window, 0.2 m/s2 at most", "hands and cables off"),
+        ("9.0 % of the points are knocks, 5 % at most", "keep knocks away"),
+        ("7.1 % of the samples of mems are missing, 5 % at most", "`fieldcal doctor --measure 5`"),
+        ("the sensor stands at none of the stated positions: the nearest is a, with chi-squared 90, the limit is 21",
+         "turn the sensor to a stated position"),
+        ("a reason of a later version", "mend what the reason of the newest windows names"),
     ],
-)
-def test_what_helps_follows_from_the_statistic_that_refuses(
-    name: str, value: float, threshold: float, words: str
-) -> None:
+)  # fmt: skip
+def test_what_helps_follows_from_the_reason(reason: str, words: str) -> None:
     for state in ("UNCALIBRATED", "COLLECTING", "VALID"):
         guide = NextSteps(configured(positions=CLAMP), turns_itself=False)
-        one, *rest = refused(name, value, threshold)
+        one, *rest = refused(reason)
         assert words not in said(guide, status(1, state), one), "one window is no reason"
         assert words in said(guide, *rest)
         assert words not in said(guide, used("theta 35 deg, alpha 0 deg"))
+
+
+def test_held_windows_are_not_refused() -> None:
+    """After the loss of a device nothing is held any more, and one refused window is no reason for a remedy."""
+    guide = NextSteps(configured(positions=CLAMP), turns_itself=False)
+    held = window(1, used=False, reason="the window contradicts the calibration")
+    held.numbers["innovation_chi2"] = 900.0
+    one, *_ = refused("9.0 % of the points are knocks, 5 % at most")
+    assert "knocks" not in said(guide, status(1), held, held, one)
+    assert "knocks" in said(guide, one, one)
 
 
 def test_held_and_what_ends_it() -> None:

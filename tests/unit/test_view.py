@@ -37,7 +37,9 @@ def full_state(windows: int = 9) -> ViewState:
     state.take(
         window(n, used=n != 4, reason="coherence 0.41 below 0.9" if n == 4 else "") for n in range(1, windows + 1)
     )
-    state.take([status(windows + 1), calibration(windows + 2)])
+    held = window(windows + 1, used=False, reason="the window contradicts the calibration")
+    held.numbers["innovation_chi2"] = 900.0
+    state.take([held, status(windows + 2), calibration(windows + 3)])
     state.publication = PublicationState("fieldcal/v1/virtual/bench", ("tcp/127.0.0.1:7447",), True, 11, "")
     state.recording = RecordingState("data/fieldcal-000001.mcap.active", 1_234_567, True)
     state.say("a Zenoh router was started")
@@ -59,7 +61,7 @@ def test_all_that_matters_is_on_the_screen(width: int, height: int) -> None:
     assert max(map(len, lines)) <= width
     for words in (
         "virtual bench, plain", "gateway virtual/bench", "up 00:01:05", "VALID", "26154 ± 12", "250 ± 80",
-        "U with k = 2, type A, white", "1000.0 Hz", "lost", "windows: 8 used, 1 refused", "used, 6000 points",
+        "U with k = 2, type A, white", "1000.0 Hz", "lost", "windows: 8 used, 1 held, 1 refused", "used, 6000 points",
         "fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (connected)", "fieldcal-000001.mcap.active, 1.23 MB",
         "a Zenoh router was started",
     ):  # fmt: skip
@@ -149,6 +151,7 @@ def test_lines_tell_each_thing_once() -> None:
         "publishing: fieldcal/v1/virtual/bench/** to tcp/127.0.0.1:7447 (connected)",
         "mems: window 7.0 to 13.0 s at 30 deg: used, 6000 points",
         "mems: window 14.0 to 20.0 s at 30 deg: used, 6000 points",
+        "mems: window 21.0 to 27.0 s at 30 deg: held: the window contradicts the calibration",
         "mems: VALID, 8 windows",
         "mems: calibration from 8 windows, U with k = 2, type A, white: main 0.046 %, transverse 0.046 %",
         "  Sxx 26154 ± 12  Sxy 120 ± 12  Sxz 50 ± 12  Qx 250 ± 80",

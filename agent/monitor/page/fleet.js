@@ -1,6 +1,6 @@
 // The fleet view: counts by kind, cards of what needs a person, all sensors by gateway, and the gateways.
 import { $, clean, full, get, make, placeOf, table, text, view } from "./common.js";
-import { ago, AXES, band, day, DAY_NS, finite, moment, now, signed, two } from "./format.js";
+import { ago, AXES, band, day, DAY_NS, finite, moment, now, signed, symbol, two } from "./format.js";
 import { card, chip, KINDS, spark, tile } from "./parts.js";
 import { saveTable } from "./picture.js";
 import { structureCard } from "./site-watch.js";
@@ -14,6 +14,23 @@ const AGAIN_MS = 60000; // after which the histories of rows that are seen are a
 const ASKED = 25; // sensors in one question
 const GATEWAYS_MAX = 500; // rows of the table of gateways
 const WAIT_MS = 600; // for the histories of the first cards
+// The columns of the table, in their order: {column, head}. page.css knows a column by its name (data-column). One with a
+// `title` has no head on a phone: there the title stands before the number. `means` explains the head.
+const COLUMNS = [
+  { column: "name", head: "Sensor" },
+  { column: "x", head: [symbol("Sxx"), ", a year, ± 1 %"] },
+  { column: "y", head: symbol("Syy") },
+  { column: "z", head: symbol("Szz") },
+  {
+    column: "change", head: "Largest change", title: "change", number: true,
+    means: "The largest change of the three main sensitivities since the accepted calibration",
+  },
+  { column: "over", head: "Change over U", title: "of U", number: true },
+  { column: "u", head: "U (k = 2)", title: "U", number: true },
+  { column: "band", head: "Valid band", title: "band", number: true },
+  { column: "good", head: "Last good window", title: "last good", number: true },
+  { column: "reference", head: "Reference, age of certificate", title: "reference" },
+];
 let shownCards = CARDS, drawnFrom = null; // from when on cards and rows are drawn
 const groups = new Map(); // by site/gateway: {element, body, rows, built, open}
 const trends = new Map(); // by name: {at, told}; what the histories of seen sensors tell
@@ -24,7 +41,8 @@ const gatewayOf = (row) => `${row.site}/${row.gateway}`;
 const put = (element, content) => { if (element.textContent !== content) element.replaceChildren(text(content)); };
 
 function wanted(row, filter) {
-  return (!filter.kind || row.kind === filter.kind) && (!filter.words || `${full(row)} ${row.kind} ${row.reference} ${row.why}`.toLowerCase().includes(filter.words));
+  const words = `${full(row)} ${row.kind} ${row.reference} ${row.why}`.toLowerCase();
+  return (!filter.kind || row.kind === filter.kind) && (!filter.words || words.includes(filter.words));
 }
 
 // --- counts
@@ -45,12 +63,21 @@ function showCounts(sensors, kind, go) {
 
 // A card for each sensor, or for a gateway that is not on the bus or whose results are mixed with others; the worst first.
 function needs(sensors, gateways) {
-  const rank = (row) => WORST.indexOf(row.kind), byGateway = (row) => row.kind === "doubled" || (row.kind === "silent" && row.gateway_state === "silent"), found = [], kindOf = (gateway) => (gateway.mixed_utc_ns ? "doubled" : "gateway");
+  const found = [], kindOf = (gateway) => (gateway.mixed_utc_ns ? "doubled" : "gateway");
+  const byGateway = (row) => row.kind === "doubled" || (row.kind === "silent" && row.gateway_state === "silent");
+  const add = (kind, key, size, need) => found.push({ key, rank: WORST.indexOf(kind), size, ...need });
+  for (const row of sensors.filter((one) => WORST.includes(one.kind) && !byGateway(one))) {
+    add(row.kind, full(row), row.size_in_u ?? row.suspected?.visit_information_nat ?? 0, { row });
+  }
   const silent = Map.groupBy(sensors.filter((row) => row.kind === "silent" && byGateway(row)), gatewayOf);
-  for (const row of sensors.filter((one) => rank(one) >= 0 && !byGateway(one))) found.push({ key: full(row), row, rank: rank(row), size: row.size_in_u ?? row.suspected?.visit_information_nat ?? 0 });
-  for (const [name, rows] of silent) found.push({ key: `gateway ${name}`, row: rows.reduce((a, b) => ((b.last_good_utc_ns ?? 0) < (a.last_good_utc_ns ?? 0) ? b : a)), rows, rank: WORST.indexOf("silent"), size: rows.length });
-  for (const gateway of gateways.filter((g) => g.why && g.alive)) found.push({ key: `state ${gatewayOf(gateway)}`, gateway, kind: kindOf(gateway), rank: WORST.indexOf(kindOf(gateway)), size: 0 });
-  for (const site of gateways.length ? latest?.sites ?? [] : []) found.push({ key: `site ${site.site}`, site, rank: WORST.indexOf("structure"), size: 0 });
+  for (const [name, rows] of silent) {
+    const oldest = rows.reduce((a, b) => ((b.last_good_utc_ns ?? 0) < (a.last_good_utc_ns ?? 0) ? b : a));
+    add("silent", `gateway ${name}`, rows.length, { row: oldest, rows });
+  }
+  for (const gateway of gateways.filter((g) => g.why && g.alive)) {
+    add(kindOf(gateway), `state ${gatewayOf(gateway)}`, 0, { gateway, kind: kindOf(gateway) });
+  }
+  for (const site of gateways.length ? latest?.sites ?? [] : []) add("structure", `site ${site.site}`, 0, { site });
   return found.sort((a, b) => a.rank - b.rank || b.size - a.size || (a.key < b.key ? -1 : 1));
 }
 
@@ -59,16 +86,31 @@ const ofGateway = (kind) => (kind !== "doubled" ? { steps: [make("p", "The state
   usable: ["bad", [make("b", "Values of its sensors may not be used"), ": nobody knows whose calibration is shown."]], steps: ofDoubled(),
 });
 
+const gatewayCard = (gateway, kind) => card({
+  kind, name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`,
+  say: [`${gateway.why}.`, ...(gateway.mixed_utc_ns ? [" Noticed ", moment(gateway.mixed_utc_ns), "."] : [])],
+  more: [], plot: null, ...ofGateway(kind),
+});
+
+// Of a gateway that is silent: `row` is its sensor that has been silent longest.
+function silentCard(row, rows, { say, usable, steps }) {
+  const moved = rows.filter((one) => one.verdicts.length).map((one) => one.sensor);
+  const names = rows.slice(0, 6).map((one) => one.sensor).join(", ");
+  return card({
+    kind: "silent", name: `gateway ${gatewayOf(row)}`, where: `${rows.length} sensors: ${names}${rows.length > 6 ? ", …" : ""}`,
+    say, usable, plot: null, steps,
+    more: moved.length ? `Before it fell silent ${moved.slice(0, 6).join(", ")} had changed.` : "Before it fell silent no drift was found.",
+  });
+}
+
 function drawn({ row, rows, gateway, kind, site }) {
   if (site) return structureCard(site);
-  if (gateway) return card({ kind, name: `gateway ${clean(gatewayOf(gateway))}`, where: `${gateway.sensors} sensors, version ${clean(gateway.version)}`, say: [`${gateway.why}.`, ...(gateway.mixed_utc_ns ? [" Noticed ", moment(gateway.mixed_utc_ns), "."] : [])], more: [], plot: null, ...ofGateway(kind) });
+  if (gateway) return gatewayCard(gateway, kind);
   const found = trends.get(full(row))?.told, { say, more } = toldOf(row, found), usable = covered(row, found);
-  if (rows) {
-    const moved = rows.filter((one) => one.verdicts.length).map((one) => one.sensor), names = rows.slice(0, 6).map((one) => one.sensor).join(", ");
-    return card({ kind: "silent", name: `gateway ${gatewayOf(row)}`, where: `${rows.length} sensors: ${names}${rows.length > 6 ? ", …" : ""}`, say, usable, more: moved.length ? `Before it fell silent ${moved.slice(0, 6).join(", ")} had changed.` : "Before it fell silent no drift was found.", plot: null, steps: steps(row, found) });
-  }
+  if (rows) return silentCard(row, rows, { say, usable, steps: steps(row, found) });
   const name = make("a", `${clean(row.gateway)} / ${clean(row.sensor)}`, { href: `#${placeOf(row)}` });
-  return card({ kind: row.kind, name, where: `${clean(row.site)}${row.reference ? `, reference ${clean(row.reference)}` : ""}`, say, usable, more, plot: cardPlot(row, found), steps: steps(row, found) });
+  const where = `${clean(row.site)}${row.reference ? `, reference ${clean(row.reference)}` : ""}`;
+  return card({ kind: row.kind, name, where, say, usable, more, plot: cardPlot(row, found), steps: steps(row, found) });
 }
 
 // A card that comes, goes or moves would push what a person reads. So it is told beside the heading, and comes when it is
@@ -76,20 +118,31 @@ function drawn({ row, rows, gateway, kind, site }) {
 const nobodyLooks = () => document.hidden || performance.now() - touchedAt > LET_GO_MS;
 
 function showCards(sensors, gateways, filter) {
-  const all = needs(sensors.filter((row) => wanted(row, filter)), filter.kind || filter.words ? [] : gateways), known = new Map(all.map((need) => [need.key, need]));
+  const all = needs(sensors.filter((row) => wanted(row, filter)), filter.kind || filter.words ? [] : gateways);
+  const known = new Map(all.map((need) => [need.key, need]));
   const best = all.slice(0, shownCards).map((need) => need.key), asked = JSON.stringify([filter, shownCards]);
-  if (!order || asked !== orderFor || nobodyLooks()) { order = sensors.length ? best : null; orderFor = asked; }
-  const keys = order ?? [], come = best.filter((key) => !keys.includes(key)).length, over = keys.filter((key) => !known.has(key)).length;
+  if (!order || asked !== orderFor || nobodyLooks()) {
+    order = sensors.length ? best : null;
+    orderFor = asked;
+  }
+  const keys = order ?? [], come = best.filter((key) => !keys.includes(key)).length;
+  const over = keys.filter((key) => !known.has(key)).length;
   const differs = [come && `${come} new`, over && `${over} over`].filter(Boolean).join(", ");
-  const odd = sensors.filter((row) => wanted(row, filter) && WORST.includes(row.kind)).length, many = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
+  const odd = sensors.filter((row) => wanted(row, filter) && WORST.includes(row.kind)).length;
+  const many = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
   put($("needs-count"), all.length ? `Needs a person: ${many(all.length, "thing")}, ${many(odd, "sensor")}` : "Nothing needs a person");
   $("new-cards").hidden = !differs && best[0] === keys[0];
   put($("new-cards"), differs ? `${differs}: show` : "Another is the worst: sort");
   for (const key of keys) {
     const need = known.get(key), before = cards.get(key);
-    const from = need && JSON.stringify([need.row?.changed, need.rows?.map((row) => row.changed), need.gateway, need.site, trends.get(need.row && full(need.row))?.at]);
+    const at = trends.get(need?.row && full(need.row))?.at;
+    const from = need && JSON.stringify([need.row?.changed, need.rows?.map((row) => row.changed), need.gateway, need.site, at]);
     if (before?.from === from || (before && inHand(before.element))) continue; // it is drawn anew when the person has let go of it
-    if (!need) { before?.element.querySelector(".chip").replaceWith(chip("over")); if (before) before.from = from; continue; }
+    if (!need) {
+      before?.element.querySelector(".chip").replaceWith(chip("over"));
+      if (before) before.from = from;
+      continue;
+    }
     const element = drawn(need);
     before?.element.replaceWith(element);
     cards.set(key, { element, from });
@@ -115,7 +168,8 @@ const stateOfRow = (row) => [row.kind, ...row.verdicts.map((v) => `${v.parameter
 function ask(rows) {
   for (const row of rows) {
     const name = full(row), before = trends.get(name);
-    if (!before || (before.changed !== row.changed && performance.now() - before.at > AGAIN_MS) || before.state !== stateOfRow(row)) waiting.set(name, row);
+    const changed = before && before.changed !== row.changed && performance.now() - before.at > AGAIN_MS;
+    if (!before || changed || before.state !== stateOfRow(row)) waiting.set(name, row);
   }
   if (!asking && waiting.size) { asking = true; setTimeout(answer, drawnFrom > performance.now() ? 0 : 30); }
 }
@@ -125,7 +179,9 @@ async function answer() {
   for (const [name] of rows) waiting.delete(name);
   try {
     const found = await get(`api/trends?${new URLSearchParams(rows.map(([name]) => ["of", name]))}`);
-    for (const [name, row] of rows) trends.set(name, { at: performance.now(), changed: row.changed, state: stateOfRow(row), told: found[name] ?? {} });
+    for (const [name, row] of rows) {
+      trends.set(name, { at: performance.now(), changed: row.changed, state: stateOfRow(row), told: found[name] ?? {} });
+    }
     for (const [name, row] of rows) groups.get(gatewayOf(row))?.built?.get(name)?.history(found[name] ?? {});
     if (drawnFrom > performance.now()) drawnFrom = 0;
     if (latest && (!drawnFrom || rows.some(([name]) => cards.has(name)))) show(latest, changing);
@@ -138,11 +194,15 @@ async function answer() {
 
 // --- the table
 
+const cellOf = ({ column, title, number, means }, role, content) => make("div", content, {
+  role, class: number ? "number" : null, "data-column": column, "data-title": title ?? null,
+  title: role === "columnheader" ? means ?? null : null,
+});
+
 // A row whose cells are updated in place, so that it is never rebuilt under a person's hands.
 class Row {
   constructor(row) {
-    const cell = (name, title) => make("div", "", { role: "cell", class: name, "data-title": title ?? null });
-    this.cells = { name: cell("name"), x: cell("curve-x"), y: cell("curve-y"), z: cell("curve-z"), change: cell("number", "change"), over: cell("number", "of U"), u: cell("number", "U"), band: cell("number", "band"), good: cell("number good", "last good"), reference: cell("reference", "reference") };
+    this.cells = Object.fromEntries(COLUMNS.map((column) => [column.column, cellOf(column, "cell", "")]));
     this.kind = make("span");
     this.cells.name.append(this.kind, make("a", row.sensor, { href: `#${placeOf(row)}` }));
     this.element = make("div", Object.values(this.cells), { role: "row", class: "row" });
@@ -165,18 +225,24 @@ class Row {
     this.known = told;
     if (!told.t_utc_ns) return;
     const from = now() - 366 * DAY_NS;
-    AXES.forEach((axis, i) => this.cells[axis].replaceChildren(spark(`S${axis}${axis} over a year`, [{ t: told.t_utc_ns, v: told.main_pct[i], tone: axis }], [from, now(), -SCALE_PCT, SCALE_PCT])));
+    AXES.forEach((axis, i) => {
+      const curve = { t: told.t_utc_ns, v: told.main_pct[i], tone: axis };
+      this.cells[axis].replaceChildren(spark(`S${axis}${axis} over a year`, [curve], [from, now(), -SCALE_PCT, SCALE_PCT]));
+    });
     const most = largest(told), [why, words] = unjudged(told), allowed = most?.over > 1 && this.row.kind === "sound";
     put(this.cells.change, most ? `${signed(most.pct, most.U)} %` : "");
-    this.cells.over.replaceChildren(...(most ? [text(`${most.over.toFixed(1)} U`), ...(allowed ? [make("small", why, { title: words })] : [])] : []));
+    const reason = allowed ? [make("small", why, { title: words })] : [];
+    this.cells.over.replaceChildren(...(most ? [text(`${most.over.toFixed(1)} U`), ...reason] : []));
     this.refer();
   }
 
   refer() {
-    const told = certificate(this.row, this.known?.certificate_utc_ns), key = `${this.row.reference} ${told.map((part) => part.textContent ?? part).join("")}`;
+    const told = certificate(this.row, this.known?.certificate_utc_ns);
+    const key = `${this.row.reference} ${told.map((part) => part.textContent ?? part).join("")}`;
     if (this.referred === key) return;
     this.referred = key;
-    this.cells.reference.replaceChildren(text(shortName(this.row.reference)), ...(told.length ? [make("span", [", ", ...told], { class: "hint" })] : []));
+    const age = told.length ? [make("span", [", ", ...told], { class: "hint" })] : [];
+    this.cells.reference.replaceChildren(text(shortName(this.row.reference)), ...age);
     this.cells.reference.title = this.row.reference;
   }
 }
@@ -190,14 +256,17 @@ const seen = new IntersectionObserver((entries) => {
   }
 }, { rootMargin: "400px" });
 
-const inHand = (element) => element.contains(document.activeElement) || (!getSelection().isCollapsed && element.contains(getSelection().anchorNode));
+const selected = (element) => !getSelection().isCollapsed && element.contains(getSelection().anchorNode);
+const inHand = (element) => element.contains(document.activeElement) || selected(element);
 
 // Draws the rows of a group that is seen, and forgets those of one that is far away.
 function fill(group) {
   if (group.seen && group.open) {
     group.built ??= new Map();
     const names = new Set(group.rows.map(full));
-    for (const [name, row] of group.built) if (!names.has(name)) { row.element.remove(); group.built.delete(name); }
+    for (const [name, row] of group.built) {
+      if (!names.has(name)) { row.element.remove(); group.built.delete(name); }
+    }
     group.rows.forEach((row, i) => {
       const name = full(row), built = group.built.get(name) ?? new Row(row), there = group.body.children[i];
       if (group.built.has(name)) built.update(row);
@@ -212,9 +281,12 @@ function fill(group) {
 }
 
 function made(name) {
-  const button = make("button", [make("span", "", { class: "group-name" }), make("span", "", { class: "hint" })], { type: "button", "aria-expanded": "true" });
-  const head = make("div", make("div", button, { role: "cell" }), { role: "row", class: "group-head" }), body = make("div", "", { role: "presentation", class: "rows" });
-  const group = { element: make("div", [head, body], { role: "rowgroup", class: "group" }), button, body, rows: [], built: null, open: true, seen: false };
+  const parts = [make("span", "", { class: "group-name" }), make("span", "", { class: "hint" })];
+  const button = make("button", parts, { type: "button", "aria-expanded": "true" });
+  const head = make("div", make("div", button, { role: "cell" }), { role: "row", class: "group-head" });
+  const body = make("div", "", { role: "presentation", class: "rows" });
+  const element = make("div", [head, body], { role: "rowgroup", class: "group" });
+  const group = { element, button, body, rows: [], built: null, open: true, seen: false };
   body.dataset.of = name;
   button.addEventListener("click", () => {
     group.open = !group.open;
@@ -229,8 +301,14 @@ function made(name) {
 const size = (group) => group.body.style.setProperty("--rows", group.open ? group.rows.length : 0);
 
 function showTable(sensors, gateways, filter) {
-  const wantedRows = Map.groupBy(sensors.filter((row) => wanted(row, filter)), gatewayOf), states = new Map(gateways.map((g) => [gatewayOf(g), g]));
-  for (const [name, group] of groups) if (!wantedRows.has(name) && !inHand(group.element)) { seen.unobserve(group.body); group.element.remove(); groups.delete(name); }
+  const wantedRows = Map.groupBy(sensors.filter((row) => wanted(row, filter)), gatewayOf);
+  const states = new Map(gateways.map((g) => [gatewayOf(g), g]));
+  for (const [name, group] of groups) {
+    if (wantedRows.has(name) || inHand(group.element)) continue;
+    seen.unobserve(group.body);
+    group.element.remove();
+    groups.delete(name);
+  }
   let last = null;
   for (const [name, rows] of wantedRows) {
     const group = groups.get(name) ?? made(name), many = group.rows.length !== rows.length;
@@ -240,12 +318,25 @@ function showTable(sensors, gateways, filter) {
     last = group.element;
     if (many) size(group);
     put(group.button.children[0], `${rows[0].site} / ${rows[0].gateway}`);
-    const state = states.get(name);
-    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${state?.alive ? stateOf(state) : state?.retired ? "retired" : "not on the bus"}`);
+    const state = states.get(name), shown = state?.alive ? stateOf(state) : state?.retired ? "retired" : "not on the bus";
+    put(group.button.children[1], `${rows.length} sensor${rows.length > 1 ? "s" : ""}, ${shown}`);
     if (group.built || group.seen) fill(group);
   }
   $("sensors").setAttribute("aria-rowcount", String(sensors.length));
   put($("none"), wantedRows.size ? "" : "No sensor is like this.");
+}
+
+// --- the gateways
+
+function showGateways(gateways) {
+  const key = JSON.stringify(gateways);
+  if ($("gateways").dataset.key === key || inHand($("gateways"))) return;
+  const stateWords = (g) => (g.alive ? g.state : g.retired ? "retired" : "");
+  const rows = gateways.slice(0, GATEWAYS_MAX).map((g) => [
+    gatewayOf(g), g.alive ? "yes" : "no", stateWords(g), g.sensors, g.version, make("span", g.why, { class: "why" }),
+  ]);
+  $("gateways").dataset.key = key;
+  $("gateways").replaceChildren(table("Gateways", ["Gateway", "On the bus", "State", "Sensors", "Version", "Why a person is needed"], rows));
 }
 
 // --- the view
@@ -275,11 +366,7 @@ export function show(told, go) {
   if (waits(told.sensors, told.gateways, filter)) return;
   showCards(told.sensors, told.gateways, filter);
   showTable(told.sensors, told.gateways, filter);
-  const rows = told.gateways.slice(0, GATEWAYS_MAX).map((g) => [gatewayOf(g), g.alive ? "yes" : "no", g.alive ? g.state : g.retired ? "retired" : "", g.sensors, g.version, make("span", g.why, { class: "why" })]), key = JSON.stringify(told.gateways);
-  if ($("gateways").dataset.key !== key && !inHand($("gateways"))) {
-    $("gateways").dataset.key = key;
-    $("gateways").replaceChildren(table("Gateways", ["Gateway", "On the bus", "State", "Sensors", "Version", "Why a person is needed"], rows));
-  }
+  showGateways(told.gateways);
 }
 
 // A picture of the table: what is filtered, with the numbers that have been seen.
@@ -292,6 +379,7 @@ function picture() {
 export const leave = () => { order = null; };
 
 export function start() {
+  $("heads").replaceChildren(...COLUMNS.map((column) => cellOf(column, "columnheader", column.head)));
   $("filter").addEventListener("input", () => changing({ filter: $("filter").value }));
   $("filters").addEventListener("submit", (event) => event.preventDefault());
   $("fleet-png").addEventListener("click", picture);
@@ -299,7 +387,9 @@ export function start() {
   document.addEventListener("visibilitychange", leave);
   addEventListener("beforeprint", () => { for (const group of groups.values()) { group.seen = true; fill(group); } });
   $("new-cards").addEventListener("click", () => { order = null; show(latest, changing); });
-  for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchmove"]) addEventListener(name, () => { touchedAt = performance.now(); }, { passive: true });
+  for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchmove"]) {
+    addEventListener(name, () => { touchedAt = performance.now(); }, { passive: true });
+  }
   $("fold").addEventListener("click", () => {
     const open = [...groups.values()].some((group) => group.open);
     for (const group of groups.values()) if (group.open === open) group.button.click();

@@ -1,4 +1,5 @@
-// All parts of the page with invented data, so that a change of page.css, parts.js or words.js is seen at once.
+// Fills parts.html: all parts of the page (parts.js) with invented data, so that a change of page.css, parts.js or
+// words.js is seen at once. No view uses it.
 import { $, make, table } from "./common.js";
 import { DAY_NS, NAMES, now, plusMinus, signed, two } from "./format.js";
 import { bars, card, chip, KINDS, may, tile } from "./parts.js";

@@ -1,4 +1,4 @@
-// The parts of which the views are made: chips, counts, cards, small plots, bars.
+// The parts of which the views are made: chips, counts, cards, small plots, bars. parts.html shows them all.
 import { make, text } from "./common.js";
 import { finite } from "./format.js";
 

@@ -74,7 +74,7 @@ function drawPlots(mine, row, trends, whole, found) {
   const transverse = all.filter((i) => i < 9 && !MAIN.includes(i));
   mine.last = times.at(-1) ?? 0;
   $("main-title").replaceChildren("Main sensitivities, change since the ", text(trends.accepted ? "accepted" : "first"), " calibration of ", from ? day(from.t_utc_ns) : "");
-  $("beyond").textContent = `${beyond.length ? "Dashed: estimates, not in force. " : ""}${refused.length ? "▴ at the lower edge: windows that are held. " : ""}`;
+  $("beyond").textContent = `${beyond.length ? "Dashed: estimates, not in force. " : ""}${refused.length ? "▴ at the lower edge: windows since then that were not used. " : ""}`;
   if (!mine.boxes) {
     mine.boxes = [boxOf(""), boxOf(""), boxOf("")];
     $("main-plot").replaceChildren(mine.boxes[0]);
@@ -208,14 +208,16 @@ function sections(place, found, whole, hours, later) {
   const gateway = `${place.get("site")}/${place.get("gateway")}`, sensor = place.get("sensor");
   const { calibration, window, drift, status, estimate, clock } = found, newest = calibration.at(-1);
   const order = (verb, sequence) => ({ gateway, sensor, verb, arguments: { sequence } });
+  // Held is what was compared with the state, and may be used once further windows confirm it.
+  const verdictOf = (w) => (w.used ? "used" : Object.hasOwn(w.numbers, "innovation_chi2") ? "held" : "refused");
   const numbers = (w) => Object.entries(w.numbers).map(([name, v]) => `${name} ${short(v)}`).join(", ");
   return [
     fold("History of calibrations", table("Calibrations", ["When", "Number", "Windows", "Method", "Roll back"], newestFirst(calibration).map((r, i) => [moment(r.t_utc_ns), r.sequence, r.windows, r.method, i === 0 ? "in force" : opener(`Roll back to ${r.sequence}`, order("rollback", r.sequence))])), csv(place, "calibration")),
     fold("Estimates that are not in force", table("Estimates", ["When", "Number", "Why not in force", "Accept"], newestFirst(estimate).map((r) => [moment(r.t_utc_ns), r.sequence, r.reason, opener(`Accept ${r.sequence}`, order("accept", r.sequence))])), csv(place, "estimate")),
     adviceSection(place), responseSection(newest), temperatureSection(newest, whole, later), spaceSection(newest, later),
-    fold("Windows", table("Windows", ["When", "Position", "Verdict", "Reason", "Numbers"], newestFirst(window).map((r) => [moment(r.t_utc_ns), r.position, r.used ? "used" : "refused", r.reason, numbers(r)])), csv(place, "window")),
+    fold("Windows", table("Windows", ["When", "Position", "Verdict", "Reason", "Numbers"], newestFirst(window).map((r) => [moment(r.t_utc_ns), r.position, verdictOf(r), r.reason, numbers(r)])), csv(place, "window")),
     fold("Drift verdicts and status", csv(place, "drift"), csv(place, "status"), table("Drift", ["When", "Parameter", "Verdict", "Since", "Reason"], newestFirst(drift).map((r) => [moment(r.t_utc_ns), r.parameter, r.verdict, r.verdict === "stable" ? "" : moment(r.onset_utc_ns), r.reason]))),
-    fold("Summarised hours", table("Summarised hours", ["Until", "Status", "Calibrations", "Estimates", "Windows used", "Windows refused", "Clock reports"], newestFirst(hours).map((r) => [moment(r.t_utc_ns), r.status, r.calibrations, r.estimates, r.windows_used, r.windows_refused, r.clocks])), make("p", make("a", "CSV", { href: `hours.csv?${place}` }))),
+    fold("Summarised hours", table("Summarised hours", ["Until", "Status", "Calibrations", "Estimates", "Windows used", "Windows not used", "Clock reports"], newestFirst(hours).map((r) => [moment(r.t_utc_ns), r.status, r.calibrations, r.estimates, r.windows_used, r.windows_refused, r.clocks])), make("p", make("a", "CSV", { href: `hours.csv?${place}` }))),
     devicesSection(newest, clock),
   ].flat();
 }

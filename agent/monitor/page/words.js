@@ -254,7 +254,7 @@ function small(curves, unit, name, { marks, to, refused, dashed }) {
   const all = curves.flatMap(({ v, u }) => v.flatMap((each, k) => [each - (u?.[k] ?? 0), each + (u?.[k] ?? 0)])).filter(finite), from = curves[0].t[0];
   const least = unit === " %" ? LEAST_PCT : 0, low = Math.min(-least, ...all), high = Math.max(least, ...all), label = `${name}: ${signed(low, 0.1 * (high - low))} to ${signed(high, 0.1 * (high - low))}${unit}`;
   const words = `${label}${dashed ? "; dashed: estimates" : ""}`;
-  return make("figure", [spark(`${words}${refused.length ? "; triangles: windows that are held" : ""}, from ${utcDay(from)} to ${utcDay(to)}`, curves, [from, to, low, high], marks, 46, refused),
+  return make("figure", [spark(`${words}${refused.length ? "; triangles: windows that were not used" : ""}, from ${utcDay(from)} to ${utcDay(to)}`, curves, [from, to, low, high], marks, 46, refused),
     make("figcaption", [make("span", words, { class: "of" }), day(from), day(to)])]);
 }
 const utcDay = (ns) => day(ns).textContent;
