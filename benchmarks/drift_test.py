@@ -1,6 +1,6 @@
 """The drift test: its false-alarm rate, and its delay compared with a CUSUM of the same false-alarm rate.
 
-`python -m benchmarks.drift_test [MILLIONS]` prints the tables of docs/online.md; 60 takes most of an hour.
+`python -m benchmarks.drift_test [MILLIONS]` prints the tables of docs/drift.md; 60 takes most of an hour.
 """
 
 from __future__ import annotations

@@ -304,9 +304,11 @@ class Estimate(Result, frozen=True, kw_only=True):
 
 
 class DriftReport(Result, frozen=True, kw_only=True):
-    """The verdict of the sequential drift test on one parameter, published when it changes.
+    """The verdict of a drift test on one parameter, published when it changes.
 
-    The data cannot show whether the sensor or the reference has changed.
+    Two tests give verdicts: the drift test on windows (steps and fast drifts), and that of net changes (a week to four
+    years; always "drifting", and its reason says "what is stated allows"). The first cannot show whether the sensor or
+    the reference has changed; the second names one of them where a second reference or a statement tells.
     """
 
     what: ClassVar[str] = "drift"
@@ -314,13 +316,13 @@ class DriftReport(Result, frozen=True, kw_only=True):
     parameter: str  # of calib.model.PARAMETERS
     verdict: Literal["stable", "drifting", "stepped"]
     change: float  # size of the step, or how far the drift has come since its onset; output unit (per m/s2)
-    u_change: float
+    u_change: float  # of a net change: the standard deviation that is stated for it, which is no uncertainty of it
     rate: float  # for "drifting": change per day
-    u_rate: float
-    onset_utc_ns: int  # when the step or the drift began
-    statistic: float
+    u_rate: float  # of a net change: as u_change, per day
+    onset_utc_ns: int  # when the step or the drift began; of a net change: the first day of its span
+    statistic: float  # of the test: above `threshold` when a change is told
     threshold: float
-    false_alarms_a_year: float
+    false_alarms_a_year: float  # as stated for the sensor: of both tests and all parameters together
     reason: str
 
 

@@ -76,7 +76,7 @@ def drivers() -> Iterator[str]:
         "Drivers",
         "find each option of each driver",
         "What `fieldcal sensors` prints: the drivers that come with fieldcal, each with its options: name, unit, "
-        "default, values, meaning. [gateway.md](../gateway.md#1-devices) says which device needs which driver.",
+        "default, values, meaning. [devices.md](../devices.md#which-driver) says which device needs which driver.",
     )
     for name in sorted(BUILT_IN):
         head, *rows = as_lines(describe(name))

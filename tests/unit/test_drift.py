@@ -154,7 +154,7 @@ def test_what_is_not_stable_says_sensor_or_reference() -> None:
 @given(scores=st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=2), information=st.floats(1e-6, 1e6))
 def test_two_windows_never_suffice(scores: list[float], information: float) -> None:
     """Whatever two windows hold, among windows that hold nothing, even at a high rate of false alarms."""
-    test = DriftTest(DriftSettings(false_alarms_a_year=100.0, windows_a_year=8766.0))
+    test = DriftTest(DriftSettings(own_false_alarms_a_year=100.0, windows_a_year=8766.0))
     for k, score in enumerate([0.0, 0.0, scores[0], 0.0, scores[1], 0.0]):
         assert test.update(k * HOUR_S, np.full(12, score), np.full(12, 1.0 if k % 2 else information)) == []
 
