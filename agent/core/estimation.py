@@ -452,7 +452,11 @@ class Estimation:
 
     def _update_in_force(self, place: int = FIRST, whole: Estimate | None = None, record: Record | None = None) -> bool:
         """Put the state's S and Q beside the reference at a place in force. `whole`: the solution from which they
-        follow, before `record` if that is named. Their budget is known where the two say the same."""
+        follow, before `record` if that is named.
+
+        Their budget is known where the two say the same. They do not where `record` has unknowns of its own, or moved
+        the estimate so far that the state linearised all windows again: then the calibration has no budget.
+        """
         self.in_force, self.law, self.budget = self.state.result(place), self.state.law(place=place), None
         whole = whole.with_window(record) if whole is not None and record is not None else whole
         if whole is not None:

@@ -262,7 +262,8 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     response: list[BandResponse] = []
     shared_errors: list[SharedError] = []  # by reference; empty where they are not known, as in older results
     # Standard uncertainties (12,) by source, whose squares add up to those of S and Q, and effective degrees of freedom
-    # (12,). Of the first calibration in force of a UTC day, and of an adopted jump; else empty.
+    # (12,). Of the first calibration in force of a UTC day, and of an adopted jump; else empty. Empty also where the
+    # window of such a calibration made the whole be solved anew; `fieldcal show --budget` solves it once more.
     budget: dict[str, list[float]] = {}
     degrees_of_freedom: list[float] = []
     # If the calibration comes into force again, after a restart or by a rollback: the result that first put it in
