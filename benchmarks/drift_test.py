@@ -44,7 +44,7 @@ def false_alarms(threshold: float, windows: int, series: int = 1000) -> int:
 
 
 class Glr:
-    """The test of calib.drift.onsets with the threshold of the product."""
+    """The test of calib.drift.onsets with the threshold for RATE, one false alarm in a million windows."""
 
     def __init__(self) -> None:
         self._onsets, self._k = Onsets(SERIES), 0

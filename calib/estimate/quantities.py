@@ -2,7 +2,7 @@
 
 A new unknown needs one `Kind` in this file and, in calib.estimate.terms, its effect on the inputs. Names are for people
 and for looking up; two places decide by them: a step of lags alone moves neither S nor Q (State._moving_steps), and
-rates explain no held window (agent.core.explaining).
+rates are not among what may explain a window that is held.
 """
 
 from __future__ import annotations
