@@ -317,9 +317,9 @@ class DriftReport(Result, frozen=True, kw_only=True):
     parameter: str  # of calib.model.PARAMETERS
     verdict: Literal["stable", "drifting", "stepped"]
     change: float  # size of the step, or how far the drift has come since its onset; output unit (per m/s2)
-    u_change: float  # of a net change: the standard deviation that is stated for it, which is no uncertainty of it
+    u_change: float  # standard uncertainty of change; NaN of a net change, whose reason has what is stated for it
     rate: float  # for "drifting": change per day
-    u_rate: float  # of a net change: as u_change, per day
+    u_rate: float  # standard uncertainty of rate; NaN of a net change
     onset_utc_ns: int  # when the step or the drift began; of a net change: the first day of its span
     statistic: float  # of the test: above `threshold` when a change is told
     threshold: float

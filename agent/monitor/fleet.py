@@ -45,7 +45,7 @@ _MAIN_NAMES = frozenset(PARAMETERS[i] for i in MAIN)
 # Fields of a verdict that a row has.
 VERDICT = ("parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "t_utc_ns",
            "false_alarms_a_year")  # fmt: skip
-# In the reason of a net change, whose `u_change` and `u_rate` are what is stated of walks (see events.DriftReport),
+# In the reason of a net change, whose `u_change` and `u_rate` are what is stated of walks in results of engines to 22,
 # and no uncertainty of the change; so a row has them as unknown.
 ALLOWED = "what is stated allows"
 # What a row adds to it: see Fleet.recall.

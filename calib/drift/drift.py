@@ -23,6 +23,7 @@ DAY_S = 86400.0
 YEAR_S = 365.25 * DAY_S
 SHORTEST_S = 1.0  # least time span of all windows, so that the number of windows per year stays finite
 NAN = float("nan")
+OFFSETS = PARAMETERS[9:]
 # Natural logarithm of the likelihood ratio at which "stepped" becomes "drifting" or the reverse: 20 to 1.
 OTHER_SHAPE = 3.0
 QUIET = 0.5  # of the threshold: below it a parameter becomes "stable" again
@@ -49,9 +50,9 @@ class DriftVerdict:
       standard uncertainty; `rate`, `u_rate`: the rate of a drift and its standard uncertainty. All are the part that
       the state has not followed yet. `onset_s`: when the step or the drift began, by the fit.
     - by the test of net changes, which is always "drifting": `change`: by how much the estimate has changed in a span
-      that ends now; `u_change`: the standard deviation of such a change by what is stated (walks, and the estimates
-      themselves), which is no uncertainty of `change`; `rate`, `u_rate`: both over the length of the span. `onset_s`:
-      the begin of the span, which is a day that is kept, not a fitted onset.
+      that ends now; `rate`: that over the length of the span. Their uncertainty is not known: the errors of two
+      estimates are correlated. `reason` has the standard deviation of such a change by what is stated. `onset_s`: the
+      begin of the span, which is a day that is kept, not a fitted onset.
     """
 
     parameter: str
@@ -183,4 +184,7 @@ def _drifting(base: DriftVerdict, ramp: FittedChange, t_s: float) -> DriftVerdic
 
 def _reason(text: str, base: DriftVerdict) -> str:
     statistic = f"the statistic {base.statistic:.1f} is above its threshold {base.threshold:.1f}"
-    return f"{text}; {statistic}; cause: sensor or reference (the data cannot tell which)"
+    cause = (
+        "offset of sensor or reference, or lean of the mount" if base.parameter in OFFSETS else "sensor or reference"
+    )
+    return f"{text}; {statistic}; cause: {cause} (the data cannot tell which)"

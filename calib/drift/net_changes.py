@@ -242,7 +242,14 @@ class NetChanges:
         )
         return [
             DriftVerdict(
-                PARAMETERS[p], "drifting", size, sd, size / days, sd / days, since * DAY_S, statistic, threshold, reason
+                PARAMETERS[p],
+                "drifting",
+                change=size,
+                rate=size / days,
+                onset_s=since * DAY_S,
+                statistic=statistic,
+                threshold=threshold,
+                reason=reason,
             )
         ]
 

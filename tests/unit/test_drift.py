@@ -136,6 +136,15 @@ def test_a_ramp_is_told_as_drift_with_its_rate(rate_a_window: float, within: int
     assert after.rate == pytest.approx(24 * rate_a_window, abs=4 * after.u_rate)
 
 
+def test_a_change_of_an_offset_may_be_a_lean_of_the_mount() -> None:
+    test = DriftTest(HOURLY)
+    for k in range(40):
+        test.update(k * HOUR_S, np.where(np.arange(12) == 9, 8.0 * (k >= 30), 0.1 * (-1.0) ** k), np.ones(12))
+    qx, *_ = test.result()[9:]
+    assert qx.verdict == "stepped"
+    assert qx.reason.endswith("offset of sensor or reference, or lean of the mount (the data cannot tell which)")
+
+
 def test_what_is_not_stable_says_sensor_or_reference() -> None:
     stepped, drifting = Feed(1).windows(50), Feed(2).windows(50)
     stepped.windows(20, lambda _: 5.0)
