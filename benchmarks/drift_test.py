@@ -1,6 +1,6 @@
 """The drift test: its false-alarm rate, and its delay compared with a CUSUM of the same false-alarm rate.
 
-`python -m benchmarks.drift_test [MILLIONS]` prints the tables of docs/online.md; 60 takes most of an hour.
+`python -m benchmarks.drift_test [MILLIONS]` prints the tables of docs/drift.md; 60 takes most of an hour.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def false_alarms(threshold: float, windows: int, series: int = 1000) -> int:
 
 
 class Glr:
-    """The test of calib.drift.onsets with the threshold of the product."""
+    """The test of calib.drift.onsets with the threshold for RATE, one false alarm in a million windows."""
 
     def __init__(self) -> None:
         self._onsets, self._k = Onsets(SERIES), 0

@@ -1,7 +1,7 @@
 """Drift far beyond what is stated, and sensors that are sound: is U right, what is told, and how often falsely?
 
 Records are drawn, not samples: a year of a sensor takes seconds. `python -m benchmarks.walks [NAME ...] [--runs N]`
-prints the tables of docs/online.md:
+prints the tables of docs/drift.md:
 
 - `defaults`: both default walks, `process.sensitivity_pct` and `certificate.stability_pct`, judged together
 - `rows`: drifts of S, a mount that tilts, a step of the reference
@@ -27,9 +27,9 @@ from agent.config import Channel
 from agent.config.knowledge import Certificate, Process
 from agent.core.estimation import Estimation
 from calib.drift.drift import DriftVerdict
+from calib.drift.net_changes import LONGEST_DAYS, NetChanges, ReferenceView
 from calib.estimate.quantities import YEAR_DAYS
 from calib.geometry import STANDARD_GRAVITY_MPS2
-from calib.state.walks import LONGEST_DAYS, ReferenceView, Walks
 from calib.windows.record import Record
 from tests.building_windows import building_window
 
@@ -104,7 +104,7 @@ def lived(
         told += [(day, verdict) for verdict in found.take(record)]
         errors.append(np.append(found.in_force.sensitivity - S(day), found.in_force.offset))
         u.append(found.in_force.standard_uncertainty)
-        widened.append(bool(found.walks.widened))
+        widened.append(bool(found.net_changes.widened))
     return Life(days, np.array(errors), np.array(u), np.array(widened), told)
 
 
@@ -232,14 +232,14 @@ def alarms(runs: int) -> None:
     zero = np.zeros(12)
     for seed in range(runs):
         values = np.cumsum(np.random.default_rng([SEED, 2, seed]).normal(size=(days, 12)), axis=0)
-        walks = Walks(rate)
+        net = NetChanges(rate)
         makers = [{f"{p}": (1.0, 1.0), "r": (1.0, 1.0)} for p in range(12)]
         for day, value in enumerate(values):
             shown = ReferenceView(float(day), value, zero, zero, a_day, zero, zero, makers, True)
-            told += len([v for v in walks.update({"A": shown}) if v.verdict == "drifting"])
-            wide += bool(walks.widened)
-            if walks.drifting:
-                walks.restart()
+            told += len([v for v in net.update({"A": shown}) if v.verdict == "drifting"])
+            wide += bool(net.widened)
+            if net.drifting:
+                net.restart()
     years = runs * days / YEAR_DAYS
     share = 100 * wide / (runs * days)
     print(

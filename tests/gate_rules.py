@@ -53,7 +53,7 @@ def jumped(t_s: float = 0.0) -> Evidence:
 
 
 def within_max_change(now: Calibration, anchor: Calibration, main_pct: float, transverse_pct: float) -> bool:
-    """The rule as docs/online.md states it, written plainly."""
+    """The rule as docs/gate.md states it, written plainly."""
     S, S0 = now.sensitivity, anchor.sensitivity
     full_scale = (abs(S0[0, 0]) + abs(S0[1, 1]) + abs(S0[2, 2])) / 3
     for i, j in product(range(3), range(3)):

@@ -218,7 +218,7 @@ class Process(Section):
     """How fast things may wander: standard deviation of a random walk after a day, growing with the square root of
     time, and the first uncertainty of a steady drift. Defaults: MEMS data sheets' stability over life, divided down."""
 
-    sensitivity_pct: NotNegative = 0.018  # 0.34 % in a year, as the default of the reference (docs/online.md)
+    sensitivity_pct: NotNegative = 0.018  # 0.34 % in a year, as the default of the reference (docs/drift.md)
     offset_mps2: NotNegative = 0.002  # 40 mm/s2 a year; ADXL355: 35 mm/s2 over the same
     offset_rate_mps2: NotNegative = 0.001  # a day: first uncertainty of the steady part
     offset_rate_walk_mps2: NotNegative = 2e-5  # a day, per square-root day

@@ -20,6 +20,7 @@ from agent.core.noise_watch import NoiseWatch
 from agent.core.time_shift import Anew, LagWatch
 from agent.core.windows import StretchWindows
 from calib.drift.drift import DriftTest, DriftVerdict
+from calib.drift.net_changes import NetChanges
 from calib.estimate.axes import LEAST_S, silent_directions
 from calib.estimate.correction import Law
 from calib.estimate.estimate import Estimate
@@ -29,7 +30,6 @@ from calib.estimate.statements import Step
 from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums, own_channels
 from calib.state.sources import Sources
 from calib.state.state import FIRST, State
-from calib.state.walks import Walks
 from calib.windows.record import Record
 
 DAY_S = 86400.0
@@ -123,7 +123,7 @@ class Estimation:
         self.residual_sd = self.state.residual_sd
         self.gate = Gate(channel.gate.filled(self.state.scale, fixed_mount=fixed), self.in_force)
         self.noise = NoiseWatch()
-        self.drift, self.walks = DriftTest(channel.drift.settings()), Walks(channel.drift.of_one_test)
+        self.drift, self.net_changes = DriftTest(channel.drift.settings()), NetChanges(channel.drift.of_one_test)
         self._held: list[Record] = []
         self._proposed: list[Proposal] = []
         self.budget: Sources | None = None  # of the calibration in force, where the whole was solved for it
@@ -262,7 +262,7 @@ class Estimation:
         self.state = jump.state
         whole = self.state.solve()
         self.drift.restart(tried.innovation.information > 0.0)
-        self.walks.restart()
+        self.net_changes.restart()
         shape = "" if jump.at_once else self._shape(day, tried.record, place)
         return replace(decision, reason="; ".join(filter(None, (f"{decision.reason}{jump.who}", shape)))), whole
 
@@ -279,7 +279,7 @@ class Estimation:
     def _drifted(self, day: float, innovation: Innovation) -> list[DriftVerdict]:
         """The verdicts on drift that changed with a window."""
         changed = self.drift.update(day * DAY_S, innovation.score, innovation.information)
-        return [v for v in changed if v.verdict != "stable" or v.parameter not in self.walks.drifting]
+        return [v for v in changed if v.verdict != "stable" or v.parameter not in self.net_changes.drifting]
 
     def _propose(self, decision: Decision, made: State | None, place: int) -> None:
         """Keep the proposal of a decision, if it has one, with the state from which it was made."""
@@ -297,8 +297,8 @@ class Estimation:
         was found, and the solution if the whole was solved anew."""
         told: list[DriftVerdict] = []
         if self.state.begins_day(day):
-            told = self.walks.update(self.state.shown())
-            self.state.widen(self.walks.widened)
+            told = self.net_changes.update(self.state.shown())
+            self.state.widen(self.net_changes.widened)
         if (whole := self.state.merge_old(day)) is not None:
             self._tried = None
         return told, whole
@@ -397,7 +397,7 @@ class Estimation:
     def _forget(self) -> None:
         """S and Q were replaced: what windows told of a drift of them before is none."""
         self.drift.restart(np.ones(12, dtype=bool))
-        self.walks.restart()
+        self.net_changes.restart()
 
     def _put_in_force(self, calibration: Calibration) -> None:
         law = self.state.law()  # the dependence of S and Q on the temperature is that of the state
@@ -415,7 +415,7 @@ class Estimation:
         """
         before, follows = self.state.reference(place), self.follows_state(place)
         if changed := self.state.meet(reference, calibrated, sensitivity, place):
-            self.walks.restart()
+            self.net_changes.restart()
         if before not in ("", self.state.reference(place)):
             self.gate.dismiss()
             self._lag_watches[place].forget()
@@ -441,7 +441,7 @@ class Estimation:
             self._held = []
         changed = self.state.restate(gravity_mps2) or size is not None
         if changed or remounted:
-            self.walks.restart()
+            self.net_changes.restart()
         return changed and follows and self._update_in_force()
 
     def follows_state(self, place: int = FIRST) -> bool:
@@ -452,7 +452,11 @@ class Estimation:
 
     def _update_in_force(self, place: int = FIRST, whole: Estimate | None = None, record: Record | None = None) -> bool:
         """Put the state's S and Q beside the reference at a place in force. `whole`: the solution from which they
-        follow, before `record` if that is named. Their budget is known where the two say the same."""
+        follow, before `record` if that is named.
+
+        Their budget is known where the two say the same. They do not where `record` has unknowns of its own, or moved
+        the estimate so far that the state linearised all windows again: then the calibration has no budget.
+        """
         self.in_force, self.law, self.budget = self.state.result(place), self.state.law(place=place), None
         whole = whole.with_window(record) if whole is not None and record is not None else whole
         if whole is not None:
@@ -511,7 +515,7 @@ class Estimation:
             "state": self.state.snapshot(),
             "gate": self.gate.snapshot(),
             "drift": self.drift.snapshot(),
-            "walks": self.walks.snapshot(),
+            "walks": self.net_changes.snapshot(),  # the name in states of earlier versions
             "noise": self.noise.snapshot(),
             "held": [record.snapshot() for record in self._held],
             "proposed": [proposal.snapshot() for proposal in self._proposed],
@@ -532,7 +536,7 @@ class Estimation:
         self.state.load(state["state"])
         self.gate.load(state["gate"])
         self.drift.load(state["drift"])
-        self.walks.load(state["walks"])
+        self.net_changes.load(state["walks"])
         self.noise.load(state["noise"])
         self._held = [Record.load(record) for record in state["held"]]
         self._proposed = [Proposal.load(proposal) for proposal in state["proposed"]]

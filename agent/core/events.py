@@ -262,7 +262,8 @@ class CalibrationUpdate(Result, frozen=True, kw_only=True):
     response: list[BandResponse] = []
     shared_errors: list[SharedError] = []  # by reference; empty where they are not known, as in older results
     # Standard uncertainties (12,) by source, whose squares add up to those of S and Q, and effective degrees of freedom
-    # (12,). Of the first calibration in force of a UTC day, and of an adopted jump; else empty.
+    # (12,). Of the first calibration in force of a UTC day, and of an adopted jump; else empty. Empty also where the
+    # window of such a calibration made the whole be solved anew; `fieldcal show --budget` solves it once more.
     budget: dict[str, list[float]] = {}
     degrees_of_freedom: list[float] = []
     # If the calibration comes into force again, after a restart or by a rollback: the result that first put it in
@@ -304,9 +305,11 @@ class Estimate(Result, frozen=True, kw_only=True):
 
 
 class DriftReport(Result, frozen=True, kw_only=True):
-    """The verdict of the sequential drift test on one parameter, published when it changes.
+    """The verdict of a drift test on one parameter, published when it changes.
 
-    The data cannot show whether the sensor or the reference has changed.
+    Two tests give verdicts: the drift test on windows (steps and fast drifts), and that of net changes (a week to four
+    years; always "drifting", and its reason says "what is stated allows"). The first cannot show whether the sensor or
+    the reference has changed; the second names one of them where a second reference or a statement tells.
     """
 
     what: ClassVar[str] = "drift"
@@ -314,13 +317,13 @@ class DriftReport(Result, frozen=True, kw_only=True):
     parameter: str  # of calib.model.PARAMETERS
     verdict: Literal["stable", "drifting", "stepped"]
     change: float  # size of the step, or how far the drift has come since its onset; output unit (per m/s2)
-    u_change: float
+    u_change: float  # standard uncertainty of change; NaN of a net change, whose reason has what is stated for it
     rate: float  # for "drifting": change per day
-    u_rate: float
-    onset_utc_ns: int  # when the step or the drift began
-    statistic: float
+    u_rate: float  # standard uncertainty of rate; NaN of a net change
+    onset_utc_ns: int  # when the step or the drift began; of a net change: the first day of its span
+    statistic: float  # of the test: above `threshold` when a change is told
     threshold: float
-    false_alarms_a_year: float
+    false_alarms_a_year: float  # as stated for the sensor: of both tests and all parameters together
     reason: str
 
 

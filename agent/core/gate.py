@@ -1,4 +1,4 @@
-"""Whether a window may change S and Q, and the status of the calibration that follows (docs/online.md)."""
+"""Whether a window may change S and Q, and the status of the calibration that follows (docs/gate.md)."""
 
 from __future__ import annotations
 

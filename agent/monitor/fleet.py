@@ -47,6 +47,9 @@ _MAIN_NAMES = frozenset(PARAMETERS[i] for i in MAIN)
 # Fields of a verdict that a row has.
 VERDICT = ("parameter", "verdict", "change", "u_change", "rate", "u_rate", "onset_utc_ns", "t_utc_ns",
            "false_alarms_a_year")  # fmt: skip
+# In the reason of a net change, whose `u_change` and `u_rate` are what is stated of walks in results of engines to 22,
+# and no uncertainty of the change; so a row has them as unknown.
+ALLOWED = "what is stated allows"
 # What a row adds to it: see Fleet.recall.
 SINCE_STABLE = ("first_utc_ns", "drifts")
 # As calib.state.state.DATED puts the date of the certificate behind the identity of a reference.
@@ -523,7 +526,7 @@ def _row(
         "status_utc_ns": status.get("t_utc_ns"),
         "reason": clipped(status.get("reason", "")),
         "gateway_state": presence.gateway,
-        "verdicts": [{name: drift[name] for name in (*VERDICT, *SINCE_STABLE)} for drift in verdicts],
+        "verdicts": [_verdict(drift) for drift in verdicts],
         "size_in_u": _in_u(verdicts[0], calibration) if verdicts else None,
         "u_pct": u_pct,
         "u_axis": u_axis,
@@ -541,8 +544,14 @@ def _row(
     }
 
 
+def _verdict(drift: Mapping[str, Any]) -> dict[str, Any]:
+    """What a row has of a verdict; `u_change`, `u_rate` are None where it tells no uncertainty of the change."""
+    told = {name: drift[name] for name in (*VERDICT, *SINCE_STABLE)}
+    return told | ({"u_change": None, "u_rate": None} if ALLOWED in drift["reason"] else {})
+
+
 def _suspected(suspicion: Suspicion, calibration: Mapping[str, Any]) -> dict[str, Any]:
-    """What is suspected, with `u_pct`: the largest U (k = 2) of a main sensitivity enlarged by it, in %; None where no
+    """What is suspected, with `u_pct`: the largest U of a main sensitivity enlarged by it, in %; None where no
     calibration is known."""
     enlarged = [
         suspicion.enlarged_u_pct(pct, PARAMETERS[i][1]) for i, pct in _main_u(calibration).items()
@@ -563,16 +572,16 @@ def dated(reference: str) -> tuple[str, int | None]:
 
 
 def _largest_u(calibration: Mapping[str, Any]) -> tuple[float | None, str]:
-    """The largest U (k = 2) of a main sensitivity, in % of it, and which one it is; None and "" where none is known."""
+    """The largest U of a main sensitivity, in % of it, and which one it is; None and "" where none is known."""
     if not calibration:
         return None, ""
     return max(((pct, PARAMETERS[i]) for i, pct in _main_u(calibration).items()), default=(None, ""))
 
 
 def _main_u(calibration: Mapping[str, Any]) -> dict[int, float]:
-    """U (k = 2) of each main sensitivity in % of it, by its index in PARAMETERS, where it is known."""
-    values, u = calibration["sensitivity"], calibration["standard_uncertainty"]
-    found = {i: 200.0 * u[i] / abs(s) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None}
+    """U of each main sensitivity in % of it, by its index in PARAMETERS, where it is known."""
+    values, u, k = calibration["sensitivity"], calibration["standard_uncertainty"], calibration["coverage_factor"]
+    found = {i: 100.0 * k * u[i] / abs(s) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None}
     return {i: pct for i, pct in found.items() if math.isfinite(pct)}
 
 
@@ -592,10 +601,10 @@ def _place(source: str) -> tuple[str, str]:
 
 
 def _in_u(drift: dict[str, Any], calibration: Mapping[str, Any]) -> float:
-    """The size of a change over U (k = 2) of the parameter in force, at most LARGEST; 0 where not known. A drift has
-    gone on since its verdict."""
+    """The size of a change over U of the parameter in force, at most LARGEST; 0 where not known. A drift has gone on
+    since its verdict."""
     change, rate = abs(drift["change"] or 0.0), abs(drift["rate"] or 0.0)
     if drift["verdict"] == "drifting" and calibration:
         change = max(change, rate * (calibration["t_utc_ns"] - drift["onset_utc_ns"]) / DAY_NS)
     u = calibration["standard_uncertainty"][PARAMETERS.index(drift["parameter"])] if calibration else None
-    return min(change / (2 * u), LARGEST) if u else 0.0
+    return min(change / (calibration["coverage_factor"] * u), LARGEST) if u else 0.0

@@ -106,7 +106,7 @@ class Suspicion(msgspec.Struct):
         )
 
     def enlarged_u_pct(self, u_pct: float, axis: str) -> float:
-        """U (k = 2) in % of the main sensitivity of `axis` with the suspected change; `u_pct`: U in force."""
+        """U in % of the main sensitivity of `axis` with the suspected change; `u_pct`: U in force."""
         if self.turn or axis not in self.axes:
             return u_pct
         return 100.0 * math.sqrt((u_pct / 100.0) ** 2 + (COVERAGE * self.size) ** 2 + self.expanded_uncertainty**2)

@@ -1,9 +1,10 @@
 """Sequential test for drift: whether a parameter has stepped or is drifting, by how much, and since when.
 
-Each window gives a score for each parameter (the normalised innovation, docs/online.md). The test is a generalised
+Each window gives a score for each parameter (the normalised innovation, docs/drift.md). The test is a generalised
 likelihood ratio over all onsets (calib.drift.onsets); its threshold follows from the stated number of false alarms
-per year (calib.drift.false_alarms). A change of the sensor and a change of the reference give the same scores; the
-reason of every verdict other than "stable" says so.
+per year (calib.drift.false_alarms). It finds what changes faster than the estimate follows; calib.drift.net_changes
+finds slow drifts. A change of the sensor and a change of the reference give the same scores; the reason of every
+verdict of this test other than "stable" says so.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ DAY_S = 86400.0
 YEAR_S = 365.25 * DAY_S
 SHORTEST_S = 1.0  # least time span of all windows, so that the number of windows per year stays finite
 NAN = float("nan")
+OFFSETS = PARAMETERS[9:]
 # Natural logarithm of the likelihood ratio at which "stepped" becomes "drifting" or the reverse: 20 to 1.
 OTHER_SHAPE = 3.0
 QUIET = 0.5  # of the threshold: below it a parameter becomes "stable" again
@@ -29,21 +31,28 @@ QUIET = 0.5  # of the threshold: below it a parameter becomes "stable" again
 
 @dataclass(frozen=True, slots=True)
 class DriftSettings:
-    """`false_alarms_a_year`: of all 12 parameters of a sensor together, by this test. `windows_a_year`: None means that
-    the number follows from the times of the windows."""
+    """`own_false_alarms_a_year`: of this test alone, for all 12 parameters of a sensor together. `windows_a_year`: None
+    means that the number follows from the times of the windows. The test of net changes has a number of its own.
+    """
 
-    false_alarms_a_year: float = 0.05
+    own_false_alarms_a_year: float = 0.05
     windows_a_year: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class DriftVerdict:
-    """The verdict on one parameter of calib.model.PARAMETERS.
+    """The verdict of one of the two tests on one parameter of calib.model.PARAMETERS.
 
-    `change`, `u_change`: size of a step, or how far a drift has come since its onset, in the parameter's unit; `rate`,
-    `u_rate`: rate of a drift per day. All are the part that the state has not followed yet. `onset_s`
-    is the time at which the step or the drift began. A value that does not apply is NaN. `statistic` and `threshold`
-    are those of the test. `reason` is empty if the parameter is stable.
+    `statistic` and `threshold` are those of the test. `reason` is empty if the parameter is stable. A value that does
+    not apply is NaN. Changes are in the parameter's unit, rates in this unit a day. The other fields mean:
+
+    - by the drift test: `change`: the size of a step, or how far a drift has come since its onset; `u_change` its
+      standard uncertainty; `rate`, `u_rate`: the rate of a drift and its standard uncertainty. All are the part that
+      the state has not followed yet. `onset_s`: when the step or the drift began, by the fit.
+    - by the test of net changes, which is always "drifting": `change`: by how much the estimate has changed in a span
+      that ends now; `rate`: that over the length of the span. Their uncertainty is not known: the errors of two
+      estimates are correlated. `reason` has the standard deviation of such a change by what is stated. `onset_s`: the
+      begin of the span, which is a day that is kept, not a fitted onset.
     """
 
     parameter: str
@@ -100,7 +109,7 @@ class DriftTest:
         pace = self._settings.windows_a_year
         if pace is None:
             pace = self._windows * YEAR_S / max(self._newest_s - self._first_s, SHORTEST_S)
-        rate = self._settings.false_alarms_a_year / (len(PARAMETERS) * pace)
+        rate = self._settings.own_false_alarms_a_year / (len(PARAMETERS) * pace)
         return max(false_alarm_threshold(rate, FEWEST, SPAN), LEAST_THRESHOLD)
 
     def _judged(self, p: int, statistic: float, threshold: float) -> DriftVerdict:
@@ -175,4 +184,7 @@ def _drifting(base: DriftVerdict, ramp: FittedChange, t_s: float) -> DriftVerdic
 
 def _reason(text: str, base: DriftVerdict) -> str:
     statistic = f"the statistic {base.statistic:.1f} is above its threshold {base.threshold:.1f}"
-    return f"{text}; {statistic}; cause: sensor or reference (the data cannot tell which)"
+    cause = (
+        "offset of sensor or reference, or lean of the mount" if base.parameter in OFFSETS else "sensor or reference"
+    )
+    return f"{text}; {statistic}; cause: {cause} (the data cannot tell which)"

@@ -25,7 +25,7 @@ from calib.estimate.gauss_newton import Linearised, gauss_newton
 from calib.estimate.innovation import Innovation, innovation
 from calib.estimate.physics import SIZE, STEP, Stack, Windows
 from calib.estimate.quantities import KINDS, LAG, PRIOR, RESPONSE, Quantity
-from calib.estimate.rows import Degrees, NoiseScores, Rows
+from calib.estimate.rows import NoiseScores, Rows, TemperatureSpread
 from calib.estimate.statements import Statements
 from calib.estimate.unknowns import Unknown, Unknowns
 from calib.model import Array
@@ -135,9 +135,9 @@ class Now:
     def rows(self, record: Record, at: Array | None = None) -> Array:
         """(r, N + 1) what a window says of the deviations from `x`, linearised at the values `at` (N,)."""
         noise = self.noise.pooled(record)
-        degrees = Degrees.of(self.unknowns, self.seen_degc, self.x)
+        spread = TemperatureSpread.of(self.unknowns, self.seen_degc, self.x)
         values, around = (self.x, self.around) if at is None else (at, at)
-        (rows,) = Rows(self.unknowns, [record], np.array([self.day]), [noise], degrees).at(values[None], around[None])
+        (rows,) = Rows(self.unknowns, [record], np.array([self.day]), [noise], spread).at(values[None], around[None])
         if at is not None:
             rows[:, -1] += rows[:, :-1] @ (at - self.x)
         return np.asarray(rows[np.abs(rows[:, :-1]).max(axis=1, initial=0.0) > 0.0])
@@ -262,8 +262,8 @@ class Estimate:
         record = together([*self.records, record], fixed=self.unknowns.statements.held_mps2 is not None)[-1]
         now = self.now
         ahead, noise = now.passed_to(record.day), now.noise.pooled(record)
-        degrees, days = Degrees.of(self.unknowns, self.seen_degc, ahead.x), np.append(self.days, record.day)
-        (rows,) = Rows(self.unknowns, [record], days[-1:], [noise], degrees).at(ahead.x[None], ahead.around[None])
+        spread, days = TemperatureSpread.of(self.unknowns, self.seen_degc, ahead.x), np.append(self.days, record.day)
+        (rows,) = Rows(self.unknowns, [record], days[-1:], [noise], spread).at(ahead.x[None], ahead.around[None])
         root, link = passed(self.root, self.unknowns.passage(float(self.days[-1]), record.day)[2], rows)
         return replace(
             self, records=[*self.records, record], noise=[*self.noise, noise], days=days, root=root,
@@ -290,8 +290,8 @@ class Estimate:
             k = int(np.searchsorted(self.days, stated.day))
             rows = self.unknowns.dated(stated, self.x[k])[:, :-1]
             add(PRIOR, ((rows @ epochs[k][0]) ** 2).sum(axis=0))
-        degrees = Degrees.of(self.unknowns, self.seen_degc, self.x[-1])
-        rows_of = Rows(self.unknowns, self.records, self.days[self.epoch_of], self.noise, degrees)
+        spread = TemperatureSpread.of(self.unknowns, self.seen_degc, self.x[-1])
+        rows_of = Rows(self.unknowns, self.records, self.days[self.epoch_of], self.noise, spread)
         by_record = [own[:, :-1] @ epochs[k][0] for own, k in zip(self.rows, self.epoch_of.tolist(), strict=True)]
         for source, variance in rows_of.shares(by_record).items():
             add(source, variance)
@@ -351,8 +351,8 @@ class _Passes:
         self.unsure = bool(untold and np.isfinite(seen_degc).all())
 
     def _rows_at(self, x: Array) -> Rows:
-        degrees = Degrees.of(self.unknowns, self.seen_degc, x)
-        return Rows(self.unknowns, self.records, self.days[self.epoch_of], self.noise, degrees)
+        spread = TemperatureSpread.of(self.unknowns, self.seen_degc, x)
+        return Rows(self.unknowns, self.records, self.days[self.epoch_of], self.noise, spread)
 
     def _between_steps(self) -> Array:
         """(K, N) how many steps each unknown has made before each epoch."""

@@ -1,7 +1,8 @@
 """The table of unknowns: each kind of quantity that can be estimated, with all that the estimators need to know of it.
 
-A new unknown needs one `Kind` in this file and, in calib.estimate.terms, its effect on the inputs. No other file
-decides anything by the name of an unknown: names are for people and for looking up.
+A new unknown needs one `Kind` in this file and, in calib.estimate.terms, its effect on the inputs. Names are for people
+and for looking up; two places decide by them: a step of lags alone moves neither S nor Q (State._moving_steps), and
+rates are not among what may explain a window that is held.
 """
 
 from __future__ import annotations

@@ -82,16 +82,16 @@ def _beside_white(found: Scattered | None) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Degrees:
-    """What a window without a temperature may have had: the lowest and highest temperature that any had, over the one
-    to which S and Q refer, the coefficients (2, 3) of Q, by power, and those (3, 3) of S."""
+class TemperatureSpread:
+    """What the temperature of a window that tells none may have been, and does: the lowest and highest one that any
+    window had, over that to which S and Q refer, the coefficients (2, 3) of Q, by power, and those (3, 3) of S."""
 
     ends_k: tuple[float, float]
     coefficients: Array
     of_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     @classmethod
-    def of(cls, unknowns: Unknowns, seen_degc: tuple[float, float], x: Array) -> Degrees:
+    def of(cls, unknowns: Unknowns, seen_degc: tuple[float, float], x: Array) -> TemperatureSpread:
         """For values x (N,) of the unknowns; temperatures `seen_degc`, NaN if no window had one."""
         found, zero = np.zeros((2, 3)), unknowns.statements.temperature.reference_degc
         for power in (1, 2):
@@ -137,7 +137,7 @@ class Rows:
         records: Sequence[Record],
         epoch_day: Array,
         noise: Sequence[NoiseScores],
-        degrees: Degrees,
+        spread: TemperatureSpread,
     ) -> None:
         s, by = unknowns.statements, dict[tuple[int, int, float, float, float, bool], list[int]]()
         for w, r in enumerate(records):
@@ -153,8 +153,8 @@ class Rows:
             pairs = [unknowns.effect(records[w], float(epoch_day[w])) for w in at]
             effect, taken_out = np.array([e for e, _ in pairs]), np.array([a for _, a in pairs])
             near = [noise[w] for w in at]
-            slopes = _Slopes(own, windows, unknowns, near, degrees)
-            means = _Means(own, windows, unknowns, near, degrees)
+            slopes = _Slopes(own, windows, unknowns, near, spread)
+            means = _Means(own, windows, unknowns, near, spread)
             by_bands = _response_information(own) if told else None
             self._groups.append(_Group(at, windows, effect, taken_out, slopes, means, by_bands))
 
@@ -226,7 +226,21 @@ def _response_information(records: Sequence[Record]) -> Array:
 
 
 class _Slopes:
-    """By what the slopes of W windows are multiplied, so that their covariance is one: `weights` (W, 6M, 6M)."""
+    """By what the slopes of W windows are multiplied, so that their covariance is one: `weights` (W, 6M, 6M).
+
+    The covariance of the slopes of a window, in units of the noise of a point, is the sum of these; `_inverse` adds
+    them up, and `shares` gives each its source in the budget. Of n merged windows, T days from the first to the last:
+
+        attribute   source in the budget                  covariance
+        _white      type A                                w I: variance over that of white noise, by near windows
+        _loaded 0   lag between windows                   l l' u(lag)^2 / n: l = derivatives by a lag
+        _loaded 1   correction for the reference's noise  s s' a^2 / n: s = the slopes; a = u of the correction
+        _missed     directions without motion             diag(d^2 u(S)^2): d = what moved a little along them
+        _spread     temperature                           c c' (range of temperature)^2, of a window that tells none
+        _beside     transverse motion between windows     b b' u(transverse)^2 / n, beside one axis at a fixed mount
+        _walked     walks and steps of S and Q            m m' (walk of S a day)^2 T / 12, each output by itself
+        _drifted    reference drift                       r r' (drift in a year)^2 T / (12 YEAR_DAYS), by channel
+    """
 
     def __init__(
         self,
@@ -234,7 +248,7 @@ class _Slopes:
         windows: Windows,
         unknowns: Unknowns,
         noise: Sequence[NoiseScores],
-        degrees: Degrees,
+        spread: TemperatureSpread,
     ) -> None:
         s, n, own = unknowns.statements, 6 * windows.channels, windows.stack
         merged, self._stretch = _merged(records)
@@ -249,7 +263,7 @@ class _Slopes:
         self._missed = (np.sqrt(silent**2 @ unknown.T**2) / own.noise[:, None]).reshape(len(records), n)
         walks = np.sqrt(unknowns.a_day[[0, 4, 8]])
         by_S = windows.moved[:, :, None, :] / own.noise[:, None, :, None]
-        self._degrees = degrees.moved(windows.told_degc, by_S)
+        self._spread = spread.moved(windows.told_degc, by_S)
         self._walked = windows.moved[:, :, None, :] * walks[:, None] / own.noise[:, None, :, None]
         drifted = np.sqrt(self._stretch / YEAR_DAYS) * [p.of(REFERENCE_DRIFT.prior) for p in priors]
         self._beside = _beside_one_axis(windows, s, np.array([p.transverse for p in priors]) / np.sqrt(merged))
@@ -262,7 +276,7 @@ class _Slopes:
         """(W, 6M, 6M) that of the root of the covariance, in units of the noise of a point."""
         one = np.eye(self._missed.shape[1])
         covariance = self._white[:, None, None] * one + self._missed[..., None] ** 2 * one
-        for scatter in (self._loaded, self._degrees, self._beside):
+        for scatter in (self._loaded, self._spread, self._beside):
             covariance = covariance + scatter @ scatter.mT
         if self._stretch.any():
             for i in range(3):
@@ -283,8 +297,8 @@ class _Slopes:
         }  # fmt: skip
         if self._beside.size:
             shares[BESIDE] = ((self._beside.mT @ moved) ** 2).sum(axis=(0, 1))
-        by_degrees = ((self._degrees.mT @ moved) ** 2).sum(axis=(0, 1))
-        return shares | ({TEMPERATURE: by_degrees} if self._degrees.size else {})
+        by_spread = ((self._spread.mT @ moved) ** 2).sum(axis=(0, 1))
+        return shares | ({TEMPERATURE: by_spread} if self._spread.size else {})
 
 
 def _beside_one_axis(windows: Windows, s: Statements, u: Array) -> Array:
@@ -321,7 +335,16 @@ def _by_channel(windows: Windows) -> Array:
 
 class _Means:
     """By what the means of W windows are multiplied, so that their covariance is one: `weights` (W, 3k, 3k); 0 where
-    nobody stated gravity."""
+    nobody stated gravity.
+
+    The covariance of a row of means is the sum of these, in output units; attribute, source in the budget, covariance
+    of n merged windows in T days:
+
+        _white      type A                                noise^2 w n / points, diagonal
+        _between    offset between windows                (u(offset between windows) scale)^2, diagonal
+        _walked     walks and steps of S and Q            (walk of Q a day + that of S times gravity) n T / 12, diagonal
+        _spread     temperature                           of Q at the ends of the range, where none is told
+    """
 
     def __init__(
         self,
@@ -329,7 +352,7 @@ class _Means:
         windows: Windows,
         unknowns: Unknowns,
         noise: Sequence[NoiseScores],
-        degrees: Degrees,
+        spread: TemperatureSpread,
     ) -> None:
         s, k = unknowns.statements, windows.stack.means.shape[1]
         merged, stretch = _merged(records)
@@ -339,9 +362,9 @@ class _Means:
         self._between = between[:, None] + np.zeros(3)
         walked = unknowns.a_day[9:] + np.outer(np.linalg.norm(windows.gravity, axis=1) ** 2, unknowns.a_day[[0, 4, 8]])
         self._walked = (stretch * merged)[:, None] * walked
-        self._degrees = np.where(windows.told_degc[:, None, None], 0.0, degrees.covariance)
+        self._spread = np.where(windows.told_degc[:, None, None], 0.0, spread.covariance)
         covariance = (self._white + (self._between + self._walked))[..., None] * np.eye(3)
-        covariance = covariance + self._degrees
+        covariance = covariance + self._spread
         inverse = np.linalg.inv(np.linalg.cholesky(covariance))
         inverse = np.where(windows.known[:, None, None], inverse, 0.0)
         self.weights = np.einsum("ab,wij->waibj", np.eye(k), inverse).reshape(len(records), 3 * k, 3 * k)
@@ -352,7 +375,7 @@ class _Means:
         square = (moved**2).sum(axis=1)
         found = {TYPE_A: self._white, OFFSETS: self._between, WALK: self._walked}
         shares = {source: np.einsum("wi,wim->m", variance, square) for source, variance in found.items()}
-        return shares | {TEMPERATURE: np.einsum("wkim,wij,wkjm->m", moved, self._degrees, moved)}
+        return shares | {TEMPERATURE: np.einsum("wkim,wij,wkjm->m", moved, self._spread, moved)}
 
 
 def _white(ratios: Sequence[float], records: Sequence[Record]) -> Array:

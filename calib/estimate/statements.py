@@ -32,7 +32,7 @@ class Step:
 @dataclass(frozen=True, slots=True)
 class Widening:
     """Between two days unknowns may have walked by more than the walks say: standard uncertainties of what they may
-    have walked besides in all of this time, by key (calib.state.walks)."""
+    have walked besides in all of this time, by key (calib.drift.net_changes)."""
 
     since: float
     until: float

@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from calib.drift.net_changes import ReferenceView, shown
 from calib.estimate.correction import Law
 from calib.estimate.determined import Flags, determined
 from calib.estimate.estimate import Estimate, Now, Then, estimate
@@ -43,7 +44,6 @@ from calib.state.over_frequency import SEVERAL, OverFrequency, changed
 from calib.state.past import Past, StatedChange, epoch_days
 from calib.state.sources import Sources
 from calib.state.thinning import NEWEST, thinned
-from calib.state.walks import ReferenceView, shown
 from calib.windows.never_turned import never_turned
 from calib.windows.record import Record, together
 

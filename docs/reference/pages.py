@@ -81,7 +81,7 @@ def drivers() -> Iterator[str]:
         "Drivers",
         "find each option of each driver",
         "What `fieldcal sensors` prints: the drivers that come with fieldcal, each with its options: name, unit, "
-        "default, values, meaning. [gateway.md](../gateway.md#1-devices) says which device needs which driver.",
+        "default, values, meaning. [devices.md](../devices.md#which-driver) says which device needs which driver.",
     )
     for name in sorted(BUILT_IN):
         head, *rows = as_lines(describe(name))
@@ -190,7 +190,7 @@ def reasons() -> Iterator[str]:
     yield from ["## Held windows", ""]
     yield from _paragraph(
         "A window that is held is kept aside until further windows confirm it, and the status is HELD. Its reason has "
-        "several parts, with a semicolon between them. [online.md](../online.md#the-gate) has the rules, and what the "
+        "several parts, with a semicolon between them. [gate.md](../gate.md) has the rules, and what the "
         "status says when HELD does not end."
     )
     yield from _remedies(HELD)

@@ -18,7 +18,7 @@ from agent.core.snapshot import pack, unpack
 from calib.model import Calibration
 from tests.gate_rules import NOMINAL, calibration, consistent, jumped, within_max_change
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "online.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "gate.md"
 COMMANDS = ("hold", "release", "accept", "rollback")
 Step = tuple[str, Calibration, Calibration | None, int]
 
@@ -130,7 +130,7 @@ def test_restored_at_any_event_it_goes_on_alike(settings_: GateSettings, seed: i
 
 
 def _table() -> Iterator[tuple[str, str, str]]:
-    """(on, from, to) of docs/online.md, one by one."""
+    """(on, from, to) of docs/gate.md, one by one."""
     rows = PAGE.read_text().split("<!-- transitions: begin -->")[1].split("<!-- transitions: end -->")[0]
     for row in rows.strip().splitlines()[2:]:
         on, before, after = (cell.strip() for cell in row.strip("|").split("|"))

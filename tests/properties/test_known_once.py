@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from calib.estimate.nuisances import Priors
 from calib.estimate.quantities import S_AND_Q, Quantity
-from calib.estimate.rows import Degrees, NoiseScores, Rows
+from calib.estimate.rows import NoiseScores, Rows, TemperatureSpread
 from calib.estimate.statements import Statements
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
@@ -58,8 +58,8 @@ class Life:
         none = Wander(dict.fromkeys(Wander.none().values, 0.0))
         unknowns = Unknowns(Statements(MEAN, U, {"": priors}, none, TemperatureModel()), [record])
         mean, u = unknowns.prior
-        degrees = Degrees.of(unknowns, (np.nan, np.nan), mean)
-        made_rows = Rows(unknowns, [record], np.array([record.day]), [NoiseScores()], degrees)
+        spread = TemperatureSpread.of(unknowns, (np.nan, np.nan), mean)
+        made_rows = Rows(unknowns, [record], np.array([record.day]), [NoiseScores()], spread)
         (found,) = made_rows.at(mean[None], mean[None])
         kept = [k for k, own in enumerate(unknowns.all) if not own.quantity.name.endswith("_rate")]
         quantities = [_of_place(unknowns.all[k].quantity) for k in kept]

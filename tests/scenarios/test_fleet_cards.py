@@ -134,6 +134,15 @@ CHANGED = [
 ]
 
 
+# What is said of a net change that the history does not show: its u is not known.
+NET_CHANGE = """async () => {
+    const { told } = await import('./words.js'), { make } = await import('./common.js'), ns = 1e6 * Date.now(), day = 86400e9;
+    const verdict = { parameter: 'Syy', verdict: 'drifting', change: 260, u_change: null, rate: 2.6, u_rate: null,
+        onset_utc_ns: ns - 100 * day, t_utc_ns: ns, first_utc_ns: ns, drifts: true, false_alarms_a_year: 0.1 };
+    const row = { kind: 'drifting', status: 'VALID', status_utc_ns: ns, reason: '', verdicts: [verdict] };
+    const { say, more } = told(row, { found: { Syy: { scale: 26000 } } });
+    return make('p', [...say, ...more]).textContent;
+}"""  # noqa: E501
 RANGE = (
     "() => [...['from', 'to'].map((n) => Number(new URLSearchParams(location.hash.slice(1)).get(n))), location.hash]"
 )
@@ -239,6 +248,9 @@ def test_each_kind_of_sensor_says_what_it_is_and_whether_its_values_may_be_used(
                 change,
             )
             assert wanted in said, (change, said)
+        said = page.evaluate(NET_CHANGE)
+        assert re.match(r"Sensitivity Syy rises by 0.3044 % a month, 1 % since .*; told on ", said), said
+        assert "±" not in said
         watched.close()
 
 

@@ -160,7 +160,7 @@ def test_disturbances(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_the_delay_of_the_drift_test() -> None:
-    page = (ROOT / "docs/online.md").read_text("utf-8")
+    page = (ROOT / "docs/drift.md").read_text("utf-8")
     for name in ("step of 30 sigma", "step of 3 sigma", "step of 1 sigma", "ramp of 0.05 sigma a window"):
         tests = drift_test.Glr(), drift_test.Cusum(1.0), drift_test.Cusum(0.25)
         means = [drift_test.delays(test, drift_test.CHANGES[name]).mean() for test in tests]
@@ -170,7 +170,7 @@ def test_the_delay_of_the_drift_test() -> None:
 
 @pytest.mark.thorough
 def test_the_false_alarms_of_the_drift_test() -> None:
-    page, windows = (ROOT / "docs/online.md").read_text("utf-8"), 1_200_000
+    page, windows = (ROOT / "docs/drift.md").read_text("utf-8"), 1_200_000
     expected = windows * false_alarm_rate(8.0, FEWEST, SPAN)
     made = f"| {8:.2f} | {windows:.3g} | {drift_test.false_alarms(8.0, windows)} | {expected:.0f} |"
     assert_same(next(line for line in page.splitlines() if line.startswith("| 8.00 |")), made)

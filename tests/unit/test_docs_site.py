@@ -66,6 +66,13 @@ def test_every_page_is_in_the_navigation() -> None:
     assert listed - {"CONTRIBUTING.md", "CHANGELOG.md"} == there
 
 
+def test_the_first_page_leads_to_every_page() -> None:
+    first = (ROOT / "docs" / "index.md").read_text("utf-8")
+    led = set(re.findall(r"\]\(([\w./-]+\.md)[#)]", first))
+    there = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    assert {page for page in there - led if not page.startswith("decisions/")} == {"index.md"}
+
+
 def guide() -> list[Path]:
     """The pages of the guide, as the navigation lists them."""
     part = (ROOT / "mkdocs.yml").read_text("utf-8").partition("  - Guide:")[2].partition("\n  - Reference:")[0]

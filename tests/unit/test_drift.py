@@ -136,6 +136,15 @@ def test_a_ramp_is_told_as_drift_with_its_rate(rate_a_window: float, within: int
     assert after.rate == pytest.approx(24 * rate_a_window, abs=4 * after.u_rate)
 
 
+def test_a_change_of_an_offset_may_be_a_lean_of_the_mount() -> None:
+    test = DriftTest(HOURLY)
+    for k in range(40):
+        test.update(k * HOUR_S, np.where(np.arange(12) == 9, 8.0 * (k >= 30), 0.1 * (-1.0) ** k), np.ones(12))
+    qx, *_ = test.result()[9:]
+    assert qx.verdict == "stepped"
+    assert qx.reason.endswith("offset of sensor or reference, or lean of the mount (the data cannot tell which)")
+
+
 def test_what_is_not_stable_says_sensor_or_reference() -> None:
     stepped, drifting = Feed(1).windows(50), Feed(2).windows(50)
     stepped.windows(20, lambda _: 5.0)
@@ -154,7 +163,7 @@ def test_what_is_not_stable_says_sensor_or_reference() -> None:
 @given(scores=st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=2), information=st.floats(1e-6, 1e6))
 def test_two_windows_never_suffice(scores: list[float], information: float) -> None:
     """Whatever two windows hold, among windows that hold nothing, even at a high rate of false alarms."""
-    test = DriftTest(DriftSettings(false_alarms_a_year=100.0, windows_a_year=8766.0))
+    test = DriftTest(DriftSettings(own_false_alarms_a_year=100.0, windows_a_year=8766.0))
     for k, score in enumerate([0.0, 0.0, scores[0], 0.0, scores[1], 0.0]):
         assert test.update(k * HOUR_S, np.full(12, score), np.full(12, 1.0 if k % 2 else information)) == []
 

@@ -87,7 +87,7 @@ def test_what_is_planned_is_what_the_agent_reaches(name: str) -> None:
     assert plan.enough == (often.gate.status == "VALID")
     first = np.sqrt(np.diag(Estimation(channel, 1.0).state.covariance()))
     last = np.sqrt(np.diag(often.state.covariance()))
-    reached = (last < 0.5 * first) | (2.0 * first <= MAX_CHANGE)  # as docs/vocabulary.md and docs/online.md say
+    reached = (last < 0.5 * first) | (2.0 * first <= MAX_CHANGE)  # as docs/vocabulary.md and docs/gate.md say
     clear = np.abs(last / first - 0.5) > 0.1
     np.testing.assert_array_equal(plan.determined[clear], reached[clear])
     u = np.sqrt(np.diag(once.state.covariance()))

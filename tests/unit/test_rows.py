@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calib.estimate.nuisances import Priors
-from calib.estimate.rows import Degrees, NoiseScores, Rows
+from calib.estimate.quantities import REFERENCE_DRIFT, TEMPERATURE, WALK
+from calib.estimate.rows import BESIDE, CORRECTION, LAGS, OFFSETS, TYPE_A, UNSEEN, NoiseScores, Rows, TemperatureSpread
 from calib.estimate.statements import Statements, Step
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
@@ -54,6 +55,35 @@ def records(pose: Pose) -> list[Record]:
     ]
 
 
+def test_each_share_is_in_the_covariance_and_the_covariance_is_in_the_shares() -> None:
+    """A merged record of a fixed mount beside one axis, without a temperature, has all that makes slopes and means
+    scatter. The shares of quantities that move with its rows add up to all of their squares."""
+    direction, told = np.array([[0.6], [0.0], [0.8]]), np.array([[0.62], [0.0], [np.sqrt(1.0 - 0.62**2)]])
+    own = replace(
+        template(Pose("p", direction, OBLIQUE), (1.0,), noise=0.01), windows=10, days=(0.0, 6.0), day=3.0,
+        attenuation=0.02, u_lag_s=1e-3, temperature_degc=np.nan, excited=told @ told.T,
+    )  # fmt: skip
+    priors = Priors.none().with_values(
+        {"lag_s": 0.01, "lag_window_s": 1e-3, "offset_mps2": 0.05, "transverse": 0.1, "reference_drift": 0.01}
+    )
+    stated = Statements(
+        np.append(2.0 * np.eye(3).ravel(), np.zeros(3)), np.full(12, 0.1), {"": priors},
+        Wander(sensitivity=1e-3, offset_mps2=0.01), TemperatureModel(1, 1), held_mps2=OBLIQUE,
+    )  # fmt: skip
+    spread = TemperatureSpread((-20.0, 20.0), np.full((2, 3), 1e-3), np.full((3, 3), 1e-3))
+    unknowns = Unknowns(stated, [own])
+    rows = Rows(unknowns, [own], np.array([3.0]), [NoiseScores()], spread)
+    (made,) = rows.at(unknowns.prior[0][None], unknowns.prior[0][None])
+    gains = np.random.default_rng(4).normal(size=(len(made), 5))
+    shares = rows.shares([gains])
+    assert set(shares) == {
+        TYPE_A, LAGS, CORRECTION, UNSEEN, BESIDE, OFFSETS, WALK, TEMPERATURE, REFERENCE_DRIFT.source,
+    }  # fmt: skip
+    total = (gains**2).sum(axis=0)
+    assert all((share > 1e-9 * total).all() for share in shares.values()), shares
+    np.testing.assert_allclose(sum(shares.values()), total, rtol=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", POSES)
 def test_derivatives_are_those_of_what_is_predicted(name: str) -> None:
@@ -68,9 +98,8 @@ def test_derivatives_are_those_of_what_is_predicted(name: str) -> None:
     # A turn is added to the left of the one before: where that is none, both are the same sum.
     x = mean + np.where(turns, 0.0, np.minimum(u, 0.1)) * random.normal(size=len(mean))
     x[:9] += 0.1 * random.normal(size=9)
-    rows = Rows(
-        unknowns, own, np.array([0.25, 0.25]), [NoiseScores(), NoiseScores()], Degrees((0.0, 0.0), np.zeros((2, 3)))
-    )
+    spread = TemperatureSpread((0.0, 0.0), np.zeros((2, 3)))
+    rows = Rows(unknowns, own, np.array([0.25, 0.25]), [NoiseScores(), NoiseScores()], spread)
 
     def at(values: np.ndarray) -> list[np.ndarray]:
         return rows.at(np.tile(values, (2, 1)), np.tile(values, (2, 1)))

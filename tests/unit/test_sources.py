@@ -14,7 +14,7 @@ from agent.core.snapshot import pack, unpack
 from agent.recording.messages import decode, encode, schema_of, topic_of
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.rows import CORRECTION, LAGS, OFFSETS, TYPE_A, Degrees, NoiseScores, Rows
+from calib.estimate.rows import CORRECTION, LAGS, OFFSETS, TYPE_A, NoiseScores, Rows, TemperatureSpread
 from calib.estimate.statements import Statements, Step
 from calib.estimate.wander import TemperatureModel
 from calib.model import Array, Calibration
@@ -63,8 +63,8 @@ class Linear:
         record, x = self.records[w], self.whole.x[w][None]
         whole, day = self.whole, self.whole.days[w : w + 1]
         other = replace(record, **{name: getattr(record, name) + error})
-        degrees = Degrees.of(whole.unknowns, whole.seen_degc, x[0])
-        rows, moved = (Rows(whole.unknowns, [r], day, [whole.noise[w]], degrees).at(x, x)[0] for r in (record, other))
+        spread = TemperatureSpread.of(whole.unknowns, whole.seen_degc, x[0])
+        rows, moved = (Rows(whole.unknowns, [r], day, [whole.noise[w]], spread).at(x, x)[0] for r in (record, other))
         return int(self._first[w]), moved[:, -1] - rows[:, -1]
 
 

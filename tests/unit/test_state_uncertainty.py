@@ -10,7 +10,7 @@ import pytest
 
 from calib.estimate.estimate import estimate
 from calib.estimate.nuisances import Priors
-from calib.estimate.rows import Degrees, NoiseScores, Rows
+from calib.estimate.rows import NoiseScores, Rows, TemperatureSpread
 from calib.estimate.statements import Dated, Statements, Step, Widening
 from calib.estimate.unknowns import Unknowns
 from calib.estimate.wander import TemperatureModel, Wander
@@ -143,7 +143,8 @@ def test_a_window_at_another_time_than_its_epoch_has_what_drifted_meanwhile() ->
     x[unknowns.at["Qz_rate"]] = 0.5
 
     def seen(epoch: float, values: np.ndarray) -> np.ndarray:
-        rows = Rows(unknowns, [own], np.array([epoch]), [NoiseScores()], Degrees((0.0, 0.0), np.zeros((2, 3))))
+        spread = TemperatureSpread((0.0, 0.0), np.zeros((2, 3)))
+        rows = Rows(unknowns, [own], np.array([epoch]), [NoiseScores()], spread)
         return np.asarray(rows.at(values[None], values[None])[0][:, -1])
 
     moved = x.copy()

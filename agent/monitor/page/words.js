@@ -31,7 +31,7 @@ const between = ([from, to]) => (day(from).textContent === day(to).textContent ?
 
 // A verdict with its numbers: those of the history where it shows the change, else its own.
 function finding(verdict, trend) {
-  const own = { size: verdict.change, u_size: verdict.u_change, rate: verdict.rate, u_rate: verdict.u_rate, onset_utc_ns: verdict.onset_utc_ns };
+  const own = { size: verdict.change, u_size: verdict.u_change ?? NaN, rate: verdict.rate, u_rate: verdict.u_rate ?? NaN, onset_utc_ns: verdict.onset_utc_ns };
   return { ...own, ...trend?.change, parameter: verdict.parameter, shape: trend?.change?.shape ?? verdict.verdict, began: beganOf(verdict, trend), told_utc_ns: trend?.change ? null : verdict.t_utc_ns, ...scaled(verdict.parameter, trend?.scale) };
 }
 

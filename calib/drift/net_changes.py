@@ -1,4 +1,4 @@
-"""Whether S, Q and the references walk as it is stated: net changes over spans from a week to four years.
+"""Test of net changes: whether S and Q have changed by more, over a week to four years, than is stated of their walks.
 
 An estimate follows a steady drift that nobody stated window by window, each time within what a random walk may do. Its
 net change is not within it: it grows with the time, that of a walk with the square root of the time. Under what is
@@ -170,9 +170,9 @@ class _ReportedChange:
     widening: Widening
 
 
-class Walks:
-    """The test of one sensor: `update` takes what its references show at the end of a day, `widened` is what walks may
-    have added so far."""
+class NetChanges:
+    """The test of one sensor: `update` takes what its references show at the end of a day, `widened` is what S, Q and
+    the references may have walked so far by more than is stated."""
 
     def __init__(self, false_alarms_a_year: float) -> None:
         """`false_alarms_a_year`: of all parameters beside all references together."""
@@ -242,7 +242,14 @@ class Walks:
         )
         return [
             DriftVerdict(
-                PARAMETERS[p], "drifting", size, sd, size / days, sd / days, since * DAY_S, statistic, threshold, reason
+                PARAMETERS[p],
+                "drifting",
+                change=size,
+                rate=size / days,
+                onset_s=since * DAY_S,
+                statistic=statistic,
+                threshold=threshold,
+                reason=reason,
             )
         ]
 

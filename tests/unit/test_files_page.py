@@ -20,7 +20,7 @@ from hw.virtual.bench import Bench
 from hw.virtual.presets import plain
 from tests.unit.test_reading_formats import GOLDEN
 
-PAGE = Path(__file__).parents[2] / "docs" / "recordings.md"
+PAGE = Path(__file__).parents[2] / "docs" / "files.md"
 FENCE = re.compile(r"^```text\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMANDS = [line for block in FENCE.findall(PAGE.read_text("utf-8")) for line in block.splitlines()]
 NEEDS = {"parquet": "pyarrow", "h5": "h5py", "tdms": "nptdms"}
