@@ -286,7 +286,8 @@ class ChannelState:
 
     def _refuse(self, window: Window, reason: str, fault: str = "") -> Iterator[Result]:
         """Report a window that is not used. After a fault of the program, and after REFUSED_IN_A_ROW such windows,
-        publish the status again with the reason, though the status does not change."""
+        publish the status again with the reason, though the status does not change. The next window that is used
+        publishes it once more."""
         yield window_report(self._source(), window, used=False, reason=reason, numbers={}, fault=fault)
         self._refused += 1
         if fault or self._refused == REFUSED_IN_A_ROW:
@@ -298,7 +299,7 @@ class ChannelState:
         if judged is None or self._estimation is None:
             yield from self._refuse(window, window.reason or f"{self.sensor} has not been connected in this run")
             return
-        self._refused = 0
+        were_refused, self._refused = self._refused >= REFUSED_IN_A_ROW, 0
         decision = judged.decision
         used = decision.action in ("take", "adopt")
         numbers = {**decision.numbers, "lag_applied_s": verdict.lag_s}
@@ -312,7 +313,8 @@ class ChannelState:
             yield estimate(source, decision.reason, self._update(decision.proposal, place))
         if decision.in_force:
             yield self._put_in_force(place=place)
-        yield from self._say_status(decision.reason)
+        said = self._say_status(decision.reason)
+        yield from [self._status_change(decision.reason)] if were_refused and used and not said else said
 
     def _put_in_force(self, earlier: CalibrationUpdate | None = None, place: int = FIRST) -> CalibrationUpdate:
         """The update that puts the estimation's calibration in force. `earlier` made it, if it was made before."""

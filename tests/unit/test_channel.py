@@ -253,3 +253,18 @@ def test_windows_refused_for_ever_are_told() -> None:
     assert [reason for _, reason in said(site.results)].count(
         "S and Q are not updated: no samples of the reference r"
     ) == 1
+
+
+@pytest.mark.slow
+def test_the_status_has_the_reason_of_refused_windows_until_one_is_used_again() -> None:
+    site = begun(site_config())
+    site.play(4)
+    site.spoiled["r"] = 0.0
+    told = said(site.play(5))
+    site.spoiled.clear()
+    told += said(site.play(5))
+    assert [(status, reason.partition(": ")[2][:24] or reason) for status, reason in told[:2]] == [
+        ("VALID", "the reference is silent:"),
+        ("VALID", "consistent with the calibration so far"),
+    ]
+    assert all(w.used for w in windows(site.results)[-3:])

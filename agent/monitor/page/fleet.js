@@ -26,7 +26,7 @@ const COLUMNS = [
     means: "The largest change of the three main sensitivities since the accepted calibration",
   },
   { column: "over", head: "Change over U", title: "of U", number: true },
-  { column: "u", head: "U", number: true },
+  { column: "u", head: "U", title: "U", number: true },
   { column: "band", head: "Valid band", title: "band", number: true },
   { column: "good", head: "Last good window", title: "last good", number: true },
   { column: "reference", head: "Reference, age of certificate", title: "reference" },
