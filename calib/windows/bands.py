@@ -222,8 +222,8 @@ def motion_band_hz(windows: Sequence[Window], *, lasting: bool = False) -> tuple
     third = np.round(3.0 * np.log2(np.sqrt(low * high))).astype(np.int64)
     end_hz = _end_below_gap(bands, each) if lasting else None
     if end_hz is not None and _tells_response(third, np.where(high <= end_hz, power, 0.0)):
-        below = [b.high_hz <= end_hz for b in bands]
-        each = [(np.where(own, a, 0.0), np.where(own, b, 0.0)) for own, (a, b) in zip(below, each, strict=True)]
+        within = [b.high_hz <= end_hz for b in bands]
+        each = [(np.where(own, a, 0.0), np.where(own, b, 0.0)) for own, (a, b) in zip(within, each, strict=True)]
         power, square = (np.concatenate(part) for part in zip(*each, strict=True))
     if not _tells_response(third, power):
         return None
