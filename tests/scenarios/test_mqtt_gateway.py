@@ -42,7 +42,6 @@ port = {port}
 """
 
 
-@pytest.mark.thorough
 @needs_mosquitto
 def test_a_broker_that_stops_delays_nothing_and_a_killed_gateway_is_off(tmp_path: Path) -> None:
     broker, config = Broker(tmp_path), tmp_path / "gateway.toml"

@@ -101,7 +101,6 @@ def agent(tmp_path: Path, imu: PtyDevice, site: Site, systemd: Systemd) -> Itera
     process.wait()
 
 
-@pytest.mark.thorough
 def test_it_tells_how_it_is_from_beginning_to_end(
     tmp_path: Path, imu: PtyDevice, site: Site, systemd: Systemd, agent: subprocess.Popen[bytes]
 ) -> None:

@@ -51,7 +51,6 @@ def on_a_terminal(tmp_path: Path, *, controlling: bool) -> Iterator[tuple[subpro
         agent.wait()
 
 
-@pytest.mark.thorough
 def test_hung_up_it_ends_as_with_ctrl_c(tmp_path: Path) -> None:
     with on_a_terminal(tmp_path, controlling=True) as (agent, person):
         os.close(person)
