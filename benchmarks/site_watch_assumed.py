@@ -2,10 +2,11 @@
 
     python -m benchmarks.site_watch_assumed [--sites 6] [--write]
 
-Of PRIOR_TESTS: the mean factor on u, where all tests of a site have once, twice and four times the variance that is
-expected. Of PART_SHARED: how far the scores of sensors correlate, of one gateway and of two, in blocks of days (sensors
-without anything in common have -1/7 at a site of 8, since the level is theirs); and how often a gateway that has
-changed for 14 days is told as this gateway.
+Of U_BAND: how many changes of 0.5 % would be found after 30 days without it, with half and twice of it, and the mean
+square of the steps of sound sensors over their u, as a check of this u. Of PRIOR_TESTS: the mean factor on u, where all
+tests of a site have once, twice and four times the variance that is expected. Of PART_SHARED: how far the scores of
+sensors correlate, of one gateway and of two, in blocks of days (sensors without anything in common have -1/7 at a site
+of 8, since the level is theirs); and how often a gateway that has changed for 14 days is told as this gateway.
 """
 
 from __future__ import annotations
@@ -24,15 +25,19 @@ import numpy as np
 from benchmarks.beam_world import BANDS_HZ, Bridge
 from benchmarks.page import write_part
 from benchmarks.site_watch import GATEWAYS, LEARNED_DAYS
+from calib.distributions import NORMAL
 from calib.model import Array
-from calib.site_watch import together, verdicts
-from calib.site_watch.day import day_of
+from calib.site_watch import together, verdicts, watch
+from calib.site_watch.day import Day, day_of
 from calib.site_watch.together import ALL, DIRECTIONS
 from calib.site_watch.watch import SiteWatch
 
 SENSORS, LATE_DAYS, FIRST_DAY, DRAWS = 8, 14, 30, 300
 PRIORS, SHARED, SIZES = (30.0, 60.0, 120.0), (0.125, 0.25, 0.5), (-0.01, 0.005)
 BLOCKS = 1, 7, 28
+BANDED, MONTH_DAYS, SMALL = (0.0, 0.00375, 0.0075, 0.015), 30, 0.005
+
+Site = tuple[Bridge, list[Day]]
 
 
 class Heard(SiteWatch):
@@ -64,34 +69,69 @@ def factors() -> list[str]:
     return lines
 
 
-def shared(sites: int) -> list[str]:
+def learning(seed: int) -> Site:
+    """A site, and the days in which it learns."""
+    bridge = Bridge(seed, SENSORS, GATEWAYS[SENSORS])
+    bridge.hour = 24 * (61 * seed % 365)
+    return bridge, [day_of(hours, BANDS_HZ) for hours in bridge.days(LEARNED_DAYS)]
+
+
+def weighed(sites: list[Site]) -> list[str]:
+    """What is found of small changes, for each scatter of a band in a day."""
+    limit, used = verdicts.limit_of(SENSORS, GATEWAYS[SENSORS]), watch.U_BAND
+    lines = [
+        "| scatter of a band in a day | 0.5 %, 30 days: found | mean square of sound steps over u |",
+        "| --- | --- | --- |",
+    ]
+    for watch.U_BAND in BANDED:
+        found, squares = [], []
+        for site in sites:
+            size, u = _stepped(*site)
+            chance = np.array([[NORMAL.cdf(SMALL / one - limit) for one in own] for own in u.tolist()])
+            found.append(0.5 * float(chance[:, :ALL].mean() + chance[:, ALL].mean()))
+            squares.append(float(np.mean(np.square(size / u))))
+        spread = 2.0 * np.std(squares) / np.sqrt(len(sites))
+        cells = f"{100.0 * np.mean(found):.1f} % | {np.mean(squares):.2f} ± {spread:.2f}"
+        lines.append(f"| {100.0 * watch.U_BAND:.3g} % | {cells} |")
+    watch.U_BAND = used
+    return lines
+
+
+def _stepped(bridge: Bridge, days: list[Day]) -> tuple[Array, Array]:
+    """Size and u (n, 4) of the steps of sensitivities MONTH_DAYS before the last of the days."""
+    site = SiteWatch(bridge.gateway, BANDS_HZ)
+    for day in days:
+        site.update(day)
+    tests = verdicts.examined(site)
+    assert tests is not None
+    k = int(np.argmin([abs(site.day - begin + 1 - MONTH_DAYS) for begin in tests.begins]))
+    return tests.joint.size[k, :, together.SENSITIVITIES], tests.joint.u[k, :, together.SENSITIVITIES]
+
+
+def shared(sites: list[Site]) -> list[str]:
     """Correlations of scores, and gateways that are told, for each part that is taken as common."""
     told: Counter[tuple[float, float]] = Counter()
     correlation: dict[int, list[tuple[float, float]]] = {days: [] for days in BLOCKS}
-    for seed in range(1000, 1000 + sites):
-        bridge = Bridge(seed, SENSORS, GATEWAYS[SENSORS])
-        bridge.hour = 24 * (61 * seed % 365)
-        days = [day_of(hours, BANDS_HZ) for hours in bridge.days(LEARNED_DAYS)]
-        watch = Heard(bridge.gateway, BANDS_HZ)
+    for bridge, days in sites:
+        site = Heard(bridge.gateway, BANDS_HZ)
         for day in days[:-LATE_DAYS]:
-            watch.update(day)
-        _correlated(np.array(watch.scores)[FIRST_DAY:], bridge.gateway, correlation)
+            site.update(day)
+        _correlated(np.array(site.scores)[FIRST_DAY:], bridge.gateway, correlation)
         for gateway in range(bridge.gateways):
             for size in SIZES:
-                changed = SiteWatch.loaded(copy.deepcopy(watch.snapshot()))
+                changed = SiteWatch.loaded(copy.deepcopy(site.snapshot()))
                 for day in days[-LATE_DAYS:]:
                     value = day.value.copy()
                     value[bridge.gateway == gateway, :, :3] += np.log1p(size)
                     changed.update(replace(day, value=value))
                 _told(changed, gateway, size, told)
-        print(f"site {seed - 999} of {sites}", flush=True)
-    cases = sites * GATEWAYS[SENSORS]
+    cases = len(sites) * GATEWAYS[SENSORS]
     lines = ["| part that is common | " + " | ".join(f"{100 * s:+g} %: told as this gateway" for s in SIZES) + " |"]
     lines.append("| --- | " + " | ".join("---" for _ in SIZES) + " |")
     lines += [f"| {part:g} | {' | '.join(f'{told[part, size]} of {cases}' for size in SIZES)} |" for part in SHARED]
     lines += ["", "| blocks of | correlation within a gateway | between gateways |", "| --- | --- | --- |"]
     for number, pairs in correlation.items():
-        mean, u = np.mean(pairs, axis=0), np.std(pairs, axis=0) / np.sqrt(sites)
+        mean, u = np.mean(pairs, axis=0), np.std(pairs, axis=0) / np.sqrt(len(sites))
         lines.append(f"| {number} d | {mean[0]:.2f} ± {2.0 * u[0]:.2f} | {mean[1]:.2f} ± {2.0 * u[1]:.2f} |")
     return lines
 
@@ -104,10 +144,10 @@ def _correlated(scores: Array, gateway: Array, correlation: dict[int, list[tuple
         pairs.append((float(c[same].mean()), float(c[gateway[:, None] != gateway].mean())))
 
 
-def _told(watch: SiteWatch, gateway: int, size: float, told: Counter[tuple[float, float]]) -> None:
+def _told(site: SiteWatch, gateway: int, size: float, told: Counter[tuple[float, float]]) -> None:
     used = verdicts.PART_SHARED
     for verdicts.PART_SHARED in SHARED:
-        told[verdicts.PART_SHARED, size] += list(verdicts.result(watch).gateways) == [gateway]
+        told[verdicts.PART_SHARED, size] += list(verdicts.result(site).gateways) == [gateway]
     verdicts.PART_SHARED = used
 
 
@@ -116,12 +156,15 @@ if __name__ == "__main__":
     parser.add_argument("--sites", type=int, default=6)
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
+    sites = [learning(1000 + k) for k in range(given.sites)]
     lines = [
         f"`python -m benchmarks.site_watch_assumed --sites {given.sites}`.",
         "",
+        *weighed(sites),
+        "",
         *factors(),
         "",
-        *shared(given.sites),
+        *shared(sites),
     ]
     if given.write:
         write_part("site-watch assumed", "\n".join(lines))

@@ -19,11 +19,9 @@ from calib.model import Array
 
 HOURS = 24
 FEWEST_HOURS = 6  # of a day, for a channel to count
-LEAST_RATIO = 3.0  # power of the signal over that of the noise, in a band and hour that count
+LEAST_RATIO = 1.5  # power of the signal over that of the noise, in a band and hour that count
 U_NOISE = 0.05  # relative standard uncertainty of the noise floor of a day
-U_FLOOR = (
-    0.003  # of the log amplitude of a whole day, however little noise there is; only ratios of weights depend on it
-)
+U_FLOOR = 0.003  # of the log amplitude of a whole day, however little noise there is; of fewer hours it is more
 CLIP = 3.0  # standard deviations
 MAD = 1.4826  # standard deviation over the median of absolute deviations, of a normal distribution
 ROUNDS = 2  # of the median polish

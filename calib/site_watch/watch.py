@@ -20,6 +20,10 @@ from calib.site_watch.witnesses import supply_basis
 
 ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
 FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, or its residual to count
+# By which a band of a sensor differs from its norm in a day, beside what its noise does; only ratios of weights depend
+# on it. Without it days of little noise would count nine times as much as others that scatter by 1.3 times as much: the
+# simulated bridge has 0.0066 to 0.010. docs/site-watch.md says what half and twice of it do.
+U_BAND = 0.0075
 MEMORY_DAYS = 60.0  # of the scatter of days: frost, traffic and wind make it another one in each season
 PRIOR_BLOCKS = 30.0  # by which a sensor's own scatter of days is drawn to that of all: its test has no wide tails
 FEWEST_SENSORS = 2  # with a band, for its common level to be taken out; of two it is their mean
@@ -79,7 +83,7 @@ class SiteWatch:
         there = np.isfinite(day.value) & ~visited[:, None, None]
         x = self._regressors(day)
         value = np.where(there, day.value, 0.0)
-        weight = np.where(there, 1.0 / np.square(day.u), 0.0)
+        weight = np.where(there, 1.0 / (U_BAND**2 + np.square(day.u)), 0.0)
         expected, u2 = self.steps.expected(x)
         residual = value - expected.reshape(self.shape)
         left = self.steps.days.reshape(self.shape) - TERMS

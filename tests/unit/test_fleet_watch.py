@@ -49,6 +49,12 @@ def lines() -> list[dict[str, Any]]:
     return made
 
 
+def z_scaled(row: dict[str, Any], factor: float) -> None:
+    """Another sensitivity of z: its power, and the cross powers xz and yz."""
+    row["band_power"] = [*row["band_power"][:8], *(value * factor**2 for value in row["band_power"][8:])]
+    row["cross_power"] = [*row["cross_power"][:4], *(value * factor for value in row["cross_power"][4:])]
+
+
 @pytest.fixture(scope="module")
 def clean() -> list[dict[str, Any]]:
     return lines()
@@ -110,7 +116,7 @@ def test_of_two_sensors_both_are_suspected(tmp_path: Path, clean: list[dict[str,
     two = [dict(row) for row in clean if row["sensor"] in "cd"]
     for row in two:
         if row["sensor"] == "c" and row["sequence"] >= 24 * CHANGED:
-            row["band_power"] = [*row["band_power"][:8], *(value * 0.97**2 for value in row["band_power"][8:])]
+            z_scaled(row, 0.97)
     found = json.loads(run(tmp_path, two, "--json", "-").stdout)
     c, d = found["sensors"]
     assert {one["verdict"] for one in (c, d)} == {"one of two"}
@@ -181,7 +187,7 @@ def test_what_users_meet(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
         rows = [dict(row) for row in clean]
         for row in rows:
             if row["sensor"] == "c" and row["sequence"] >= 24 * CHANGED:  # as if it had not changed
-                row["band_power"] = [*row["band_power"][:8], *(value / 0.97**2 for value in row["band_power"][8:])]
+                z_scaled(row, 1.0 / 0.97)
             if not late or row["sequence"] >= 24 * CHANGED:
                 change(row)
         found: dict[str, Any] = json.loads(run(tmp_path, rows, "--json", "-").stdout)
@@ -224,7 +230,7 @@ def test_a_visit_says_what_it_found_where_the_calibrations_are_told(
     for row in rows:
         if row["sensor"] == "c" and row["sequence"] >= visited:
             row["calibration_sequence"] = 4
-            row["band_power"] = [*row["band_power"][:8], *(value / 0.97**2 for value in row["band_power"][8:])]
+            z_scaled(row, 1.0 / 0.97)
     made: list[dict[str, Any]]
     made = [{"key": f"fieldcal/v1/bridge/middle/c/{what}", "sensor": "c", "run_id": "run", "sequence": sequence,
              "sensitivity": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, zz]]}
