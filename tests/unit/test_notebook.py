@@ -286,6 +286,18 @@ def test_warnings_stand_above_the_table(result: Outcome, capsys: pytest.CaptureF
     assert json.loads(warned.to_json())["warnings"] == ["det S is negative", "the reference reads 260 g"]
 
 
+def test_beside_the_json_object_warnings_are_on_standard_error(
+    result: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dataclasses import replace
+
+    monkeypatch.setattr("agent.cli.calibrate.calibrated", lambda _: replace(result, warnings=("det S is negative",)))
+    assert run_cli(["calibrate", f"--sensor={as_csv(tmp_path / 'sensor.csv', SENSOR)}", "--json=-"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["warnings"] == ["det S is negative"]
+    assert said.err == "WARNING: det S is negative\n"
+
+
 @pytest.mark.slow
 def test_the_figure_shows_s_q_response_and_windows(result: Outcome) -> None:
     figure = result.plot()
