@@ -15,6 +15,7 @@ import pytest
 
 from agent.cli.main import run_cli
 from calib import Calibration, InputError, calibrate
+from calib.recorded.errors import OptionError
 from calib.recorded.options import DEFAULTS, Options
 from calib.recorded.outcome import Outcome
 from docs.images.notebook_run import NOTEBOOK, outputs
@@ -200,6 +201,15 @@ def test_data_that_are_refused_are_no_exception() -> None:
     assert np.isnan(found.values).all()
     assert not found.determined.any()
     assert "refused" in found._repr_html_()
+
+
+def test_s_holds_at_a_frequency_within_the_band() -> None:
+    given = {"reference": True, "poses": True, "prior": False}
+    for at_hz in (1.0, 5.0, 10.0):
+        Options(band_hz=(1.0, 10.0), reference_frequency_hz=at_hz).check(**given)
+    for at_hz in (0.9, 10.1):
+        with pytest.raises(OptionError, match="outside `band_hz`"):
+            Options(band_hz=(1.0, 10.0), reference_frequency_hz=at_hz).check(**given)
 
 
 def test_an_option_that_is_not_there_is_named_with_the_one_that_is_near() -> None:
