@@ -264,5 +264,5 @@ def test_the_greatest_error_of_the_clock_stands_beside_the_estimated_one(monkeyp
         struct.pack_into("@iqqqqi", buffer, 0, 0, -3, 5, 1500, 77, 64)
         return 0
 
-    monkeypatch.setattr(machine_checks.ctypes, "CDLL", lambda *_, **__: SimpleNamespace(adjtimex=adjtimex))
+    monkeypatch.setattr("agent.setup.machine_checks.ctypes.CDLL", lambda *_, **__: SimpleNamespace(adjtimex=adjtimex))
     assert machine_checks.kernel_clock() == (64, 1500)
