@@ -228,6 +228,8 @@ def test_the_graph_leads_from_the_certificate_to_the_files_and_the_reference(tmp
     path = tmp_path / "result.json"
     path.write_text(json.dumps(fields(windows=windows)))
     held = content([path], stated(tmp_path))
+    assert held["conditions"]["positions"] == ["p0", "p2"]  # of the windows that were used
+    assert held["conditions"]["temperature_degc"] == [18.0, 21.5]  # as stated
     graph = held["provenance"]
     names = {*graph["entity"], *graph["activity"], *graph["agent"]}
     relations = [r for kind in graph if kind.startswith(("was", "used")) for r in graph[kind].values()]

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from agent.cli.main import run_cli
 from agent.cli.stopping import STOP_SIGNALS
+from agent.config.syntax import syntax_fault
 
 GOOD = """[gateway]
 site = "bridge"
@@ -82,6 +84,20 @@ def test_a_sound_configuration_is_good(tmp_path: Path, capsys: pytest.CaptureFix
         "transverse 1.1 %, offset 0.18 m/s2, without the reference's own, with motion of 5 m/s2 rms",
         *(f"  filters of {device}: none stated; its response is estimated with S" for device in ("imu", "laser")),
     ]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[process]\nx = 1\n# a\n[process]\n", "process is there twice, first in line 1; state all its settings in one "
+         "place; where there are several, each begins with [[process]]"),
+        ("x = 1\ny = 2\n\nx = 3\n", "x is there twice, first in line 1; remove one of them"),
+    ],
+)  # fmt: skip
+def test_what_is_there_twice_is_told_with_the_line_of_the_first(text: str, told: str) -> None:
+    with pytest.raises(tomllib.TOMLDecodeError) as refused:
+        tomllib.loads(text)
+    assert syntax_fault(text, refused.value) == (4, told)
 
 
 @pytest.mark.parametrize("calibrated", ["2001-05-01", '"2001-05-01"'])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agent.bench.clamp_words import findings
-from agent.bench.growth import MONTH_DAYS, Growth
+from agent.bench.growth import MONTH_DAYS, growth
 from agent.bench.visit_dialogue import forbidden
 from agent.bench.visiting import ahead
 from benchmarks.visits import Visit
@@ -99,7 +99,8 @@ def test_u_grows_as_the_configuration_states():
     """After a year: a walk of 0.018 % a day, and 10 K at 0.02 %/K; the date is where U crosses the limit."""
     channel = Visit.drawn(1, Clamped()).channel
     u_main = 0.001
-    later = Growth(channel, np.eye(3), np.full(12, u_main**2), 10.0)
+    u = {"sensitivity": np.full((3, 3), u_main).tolist(), "offset": [u_main] * 3}
+    later = growth(channel, {"sensitivity": np.eye(3).tolist(), "standard_uncertainty": u}, 10.0)
     year_days = 12.0 * MONTH_DAYS
     expected = 200.0 * np.sqrt(u_main**2 + (1.8e-4) ** 2 * year_days + (2e-4 * 10.0) ** 2)
     assert later.main_pct(year_days) == pytest.approx(expected, rel=1e-6)

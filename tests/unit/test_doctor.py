@@ -6,6 +6,7 @@ import json
 import math
 import os
 import socket
+import struct
 import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -254,3 +255,14 @@ def test_the_command_tells_all_and_its_status(tmp_path: Path, capsys: pytest.Cap
     path.write_text("[gateway]\nsite = 3\n")
     assert run_cli(["doctor", str(path), "--data-dir", str(tmp_path)]) == 3
     assert "line 2: gateway.site" in capsys.readouterr().out
+
+
+def test_the_greatest_error_of_the_clock_stands_beside_the_estimated_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """struct timex of 64-bit Linux: modes, offset, freq, maxerror, esterror, status (adjtimex(2))."""
+
+    def adjtimex(buffer: Any) -> int:
+        struct.pack_into("@iqqqqi", buffer, 0, 0, -3, 5, 1500, 77, 64)
+        return 0
+
+    monkeypatch.setattr("agent.setup.machine_checks.ctypes.CDLL", lambda *_, **__: SimpleNamespace(adjtimex=adjtimex))
+    assert machine_checks.kernel_clock() == (64, 1500)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib.estimate.nuisances import Priors
 from calib.estimate.wander import TemperatureModel, Wander
-from calib.state.state import State
+from calib.model import Calibration
+from calib.state.state import State, _equal
 from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE
@@ -114,3 +117,10 @@ def test_a_calibration_put_back_does_not_count_the_error_of_the_reference_again(
             window = building_window(np.random.default_rng(k), level_mps2=(0.1, 0.1, 0.1))
             found.update(Record.of(window, 1.0 + turn + k * HOUR, reference="A"))
         assert found.result().standard_uncertainty[0] > 2.99e-3
+
+
+def test_what_changes_the_covariance_alone_is_a_change() -> None:
+    one = Calibration(np.eye(3), np.zeros(3), np.eye(12), np.ones(12, dtype=bool), np.inf, "")
+    assert _equal(one, replace(one, covariance=np.eye(12)))
+    for other in ({"covariance": 2.0 * np.eye(12)}, {"sensitivity": 2.0 * np.eye(3)}, {"offset": np.ones(3)}):
+        assert not _equal(one, replace(one, **other))

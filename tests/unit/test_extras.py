@@ -37,6 +37,17 @@ def test_a_part_that_does_not_exist(capsys: pytest.CaptureFixture[str]) -> None:
     assert "no part 'reports'; the parts are report, files" in capsys.readouterr().err
 
 
+def test_what_pip_says_is_told_where_it_fails(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fails = [sys.executable, "-S", "-c", "print('no matching distribution'); raise SystemExit(1)"]
+    monkeypatch.setattr("agent.cli.extras.install_command", lambda *_: fails)
+    assert run_cli(["extras", "--install", "report", "--index"]) == 1
+    assert capsys.readouterr().err.splitlines()[1:] == [
+        "no matching distribution", "fieldcal extras: pip could not install this from the package index",
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("name", parts.PURPOSES)
 def test_each_part_is_locked_with_what_it_needs(name: str) -> None:
     """Each requirement has a version with a hash that fits, and nothing of the gateway's own lock is there again."""

@@ -10,6 +10,9 @@ import pytest
 
 from agent.cli.main import run_cli
 from agent.config.earlier import read_earlier
+from agent.fleet.meeting import stated_calibration
+from agent.fleet.site_file import DeviceSection
+from agent.reading.source import TableError
 from tests.unit.drawn_recording import Devices, Recording
 from tests.unit.recorded_bench import record
 from tests.unit.test_reading_formats import GOLDEN
@@ -150,6 +153,17 @@ def test_faults_of_the_file_are_named(
     assert out == ""
     assert fault in err
     assert "Traceback" not in err
+
+
+def test_a_reference_with_a_certificate_has_its_values_and_their_covariance(directory: Path) -> None:
+    stated = {"sensitivity": (208.0 * np.eye(3)).tolist(), "offset": [1.0, 2.0, 3.0], "covariance": np.eye(12).tolist()}
+    (directory / "certificate.json").write_text(json.dumps(stated))
+    told = stated_calibration(DeviceSection(certificate=Path("certificate.json")), directory)
+    assert told is not None
+    np.testing.assert_array_equal(told[0], [*(208.0 * np.eye(3)).ravel(), 1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(told[1], np.eye(12))
+    with pytest.raises(TableError, match=r"singular.json, sensitivity: the matrix cannot be inverted"):
+        stated_calibration(DeviceSection(certificate=Path("singular.json")), directory)
 
 
 def test_a_link_that_is_refused_is_left_out_with_its_reason(

@@ -9,6 +9,7 @@ import pytest
 
 from calib.excitation.front_end import Aligned, aligned, windows_of
 from calib.model import Array, Pose
+from calib.signal.band import without_short_holes
 from calib.signal.holes import short_holes_filled
 from calib.signal.instrument import Instrument
 from calib.signal.samples import Samples
@@ -101,6 +102,22 @@ def test_the_sensitivity_scatters_as_the_real_samples_tell(lost: str) -> None:
         u_slope = np.sqrt(np.diag(np.linalg.inv(basis.T @ basis))[1:4, None] * variance)
         errors.append((solution[1:4] - S_TRUE.T) / u_slope)
     assert 0.88 < np.sqrt(np.mean(np.square(errors))) < 1.13
+
+
+def test_holes_of_the_reference_are_filled_by_its_own_band_where_the_sensor_feels_a_wider_one() -> None:
+    """The sensor's motion of 24 Hz leaves hardly any of the spectrum between which a value could be filled."""
+    random = np.random.default_rng(7)
+    u, V = (motion(random, 4600, high_hz, 0.05) for high_hz in (6.0, 24.0))
+    exact = u + REFERENCE_NOISE * random.normal(size=u.shape)
+    u = exact.copy()
+    holes = np.arange(40, 4560, 40)
+    u[holes] = np.nan
+    filled_u, _, filled, none = without_short_holes(
+        u, V + REFERENCE_NOISE * random.normal(size=V.shape), (100.0, 100.0)
+    )
+    assert np.flatnonzero(filled).tolist() == holes.tolist()
+    assert not none.any()
+    assert np.sqrt(np.mean((filled_u - exact)[holes] ** 2)) < 1.5 * REFERENCE_NOISE
 
 
 def test_without_a_filter_a_filled_sample_of_the_sensor_is_no_point() -> None:

@@ -82,6 +82,12 @@ def test_lsm6dso_states_its_own_rate(rate_hz: float, freq_fine: int, actual_hz: 
     assert lsm6dso_registers.actual_rate_hz(rate_hz, freq_fine) == pytest.approx(actual_hz, abs=1e-3)
 
 
+def test_mpu6050_filter_is_the_widest_that_is_not_wider_than_half_the_rate() -> None:
+    # DLPF_CFG of RM-MPU-6000A 4.3: 1 is 184 Hz, 2 94 Hz, 3 44 Hz, 4 21 Hz, 5 10 Hz, 6 5 Hz
+    codes = {1000.0: 1, 200.0: 2, 100.0: 3, 43.0: 4, 42.0: 4, 20.0: 5, 19.0: 6, 4.0: 6}
+    assert {rate_hz: mpu6050_registers.low_pass_code(rate_hz) for rate_hz in codes} == codes
+
+
 def test_mpu6050_self_test_figures_of_the_maker() -> None:
     # RM-MPU-6000A 4.1: bits 4:2 of the codes in the axes' registers, bits 1:0 in the fourth; 0.34 g at 1, 0.92 g at 31.
     part = mpu6050_registers.PARTS[0x68]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hw.block import BlockFlags, Drop, SampleBlock
-from hw.cutting import Cutter
-from hw.line_columns import Column, columns_of, kind_of
+from hw.cutting import Break, Cutter
+from hw.line_columns import Column, DeviceTime, columns_of, kind_of
 from hw.line_stream import LineStream
 from hw.lines import UNREADABLE
 
@@ -314,6 +314,12 @@ def test_a_new_port_begins_anew_and_the_index_goes_on() -> None:
     feed(listening, numbered(1, 2) + b"3,")
     listening.begin()
     assert shape(feed(listening, b"9\n", numbered(4, 5))) == [(2, 2, RESTART)]
+
+
+def test_a_gap_in_the_device_s_time_has_at_most_the_samples_that_are_filled() -> None:
+    """At 10 ticks a sample: 1 and 3 samples are missing, then 4, where 3 are the most."""
+    found = DeviceTime(1000.0, 100.0, 3).breaks(np.array([10.0, 20.0, 40.0, 50.0, 90.0, 100.0, 150.0]))
+    assert found == [Break(2, GAP, 1), Break(4, GAP, 3), Break(6, RESTART)]
 
 
 def damage(text: bytes, rng: np.random.Generator) -> bytes:

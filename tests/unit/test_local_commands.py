@@ -73,6 +73,11 @@ def test_without_an_agent_it_is_one_clear_line(tmp_path: Path) -> None:
     for directory in (tmp_path, tmp_path / "no"):
         with pytest.raises(ConnectionError, match="no agent takes commands here"):
             LocalAgent(directory)
+    write_new(tmp_path, {"anna.key": SigningKey("anna", ANNA).pem})
+    words = ["hold", "--sensor", "mems", "--key", str(tmp_path / "anna.key"), "--data-dir", str(tmp_path)]
+    done = CliRunner().invoke(command, words, standalone_mode=False)
+    assert (done.return_value, done.stdout) == (1, "")
+    assert re.fullmatch("fieldcal command: .*no agent takes commands here.*\n", done.stderr)
 
 
 def test_a_socket_that_a_killed_agent_left_is_no_obstacle(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from agent.cli.main import run_cli
 from calib import Calibration, InputError, calibrate
+from calib.recorded.errors import OptionError
 from calib.recorded.options import DEFAULTS, Options
 from calib.recorded.outcome import Outcome
 from docs.images.notebook_run import NOTEBOOK, outputs
@@ -202,6 +203,15 @@ def test_data_that_are_refused_are_no_exception() -> None:
     assert "refused" in found._repr_html_()
 
 
+def test_s_holds_at_a_frequency_within_the_band() -> None:
+    given = {"reference": True, "poses": True, "prior": False}
+    for at_hz in (1.0, 5.0, 10.0):
+        Options(band_hz=(1.0, 10.0), reference_frequency_hz=at_hz).check(**given)
+    for at_hz in (0.9, 10.1):
+        with pytest.raises(OptionError, match="outside `band_hz`"):
+            Options(band_hz=(1.0, 10.0), reference_frequency_hz=at_hz).check(**given)
+
+
 def test_an_option_that_is_not_there_is_named_with_the_one_that_is_near() -> None:
     with pytest.raises(TypeError, match="no option 'u_angel_deg'; is 'u_angle_deg' meant"):
         calibrate(SENSOR, u_angel_deg=1)
@@ -284,6 +294,18 @@ def test_warnings_stand_above_the_table(result: Outcome, capsys: pytest.CaptureF
         assert lines[at - 2 : at] == ["WARNING: det S is negative", "WARNING: the reference reads 260 g"]
     assert "<b>Warning: det S is negative</b>" in warned._repr_html_()
     assert json.loads(warned.to_json())["warnings"] == ["det S is negative", "the reference reads 260 g"]
+
+
+def test_beside_the_json_object_warnings_are_on_standard_error(
+    result: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dataclasses import replace
+
+    monkeypatch.setattr("agent.cli.calibrate.calibrated", lambda _: replace(result, warnings=("det S is negative",)))
+    assert run_cli(["calibrate", f"--sensor={as_csv(tmp_path / 'sensor.csv', SENSOR)}", "--json=-"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["warnings"] == ["det S is negative"]
+    assert said.err == "WARNING: det S is negative\n"
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import pytest
 from agent.config import Config, ConfigError, parse_config
 from agent.core.events import Command, DeviceChange, Output, StatusChange, WindowReport
 from agent.core.pipeline import Pipeline
+from agent.core.positions import FoundPositions
 from hw.block import BlockFlags, DeviceInfo, SampleBlock
 
 SECOND = 1_000_000_000
@@ -170,6 +171,15 @@ def test_lost_samples_end_a_stretch_and_the_same_stop_is_found_again() -> None:
     times = [(w.start_s, w.stop_s) for w in found]
     np.testing.assert_allclose(times, [(0.5, 19.5), (21.5, 46.5)], atol=TRIMMED_S + 0.01)
     assert {w.position for w in found} == {NAMES[1]}
+
+
+def test_a_snapshot_brings_back_every_number() -> None:
+    found = FoundPositions(configured().channels[0])
+    state = found.snapshot()
+    state |= {"before": [17.5, FACES[1]], "stood": [2, NAMES[1], True], "edges_s": [16.0, 3.0], "serial": 2}
+    later = FoundPositions(configured().channels[0])
+    later.load(state)
+    np.testing.assert_equal(later.snapshot(), state)
 
 
 def test_an_operators_pose_holds_until_the_next_change() -> None:

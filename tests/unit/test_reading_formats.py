@@ -6,6 +6,7 @@ import io
 import struct
 import wave
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 
 from agent.calibrate.tables import read_reference, read_sensor
 from agent.proto import fieldcal_pb2 as pb
+from agent.reading import arrow
 from agent.reading.source import TableError
 from tests.unit.test_reading_csv import HEADER, VALUES, table, written
 
@@ -157,6 +159,14 @@ def test_dates_and_gaps_of_pandas(unit: str, tmp_path: Path) -> None:
     gap[:, 0] = gap[:, 0].astype(np.float32)
     gap[5] = np.nan
     same(tmp_path / "a.parquet", 1_700_000_000 + TIME_S, gap)
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_a_date_that_is_missing_is_no_number(unit: str) -> None:
+    import pyarrow
+
+    dates = pyarrow.array([None, datetime(2023, 11, 14, 22, 13, 20)], pyarrow.timestamp(unit))
+    np.testing.assert_array_equal(arrow._values(dates), [np.nan, 1_700_000_000.0])
 
 
 @pytest.mark.slow

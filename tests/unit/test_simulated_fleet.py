@@ -26,6 +26,7 @@ from agent.core.events import CalibrationUpdate, DriftReport, Estimate, Result, 
 from agent.delivery.consumer import Consumer, Received
 from agent.fleet import simulated_processes
 from agent.fleet.simulated import NEVER, ODD, FleetPlan, SimulatedFleet, SimulatedGateway, Stories, behaviours
+from agent.fleet.simulated_channel import NOMINAL
 from agent.fleet.simulated_processes import FleetProcesses, ProcessEnded
 from agent.fleet.simulated_sensor import BEGINS, Behaviour, SimulatedSensor, Story
 from tests.unit.zenoh_site import Site, taken_until, wait_for
@@ -135,6 +136,12 @@ def test_statuses_are_those_of_the_agent_and_a_held_sensor_puts_nothing_in_force
     # What ends HELD is put in force just before the status tells it.
     assert [r for r in results if isinstance(r, CalibrationUpdate) and held < r.sequence < ended - 1] == []
     assert truth["begun"] == (behaviour != "sound")
+
+
+@pytest.mark.parametrize("behaviour", ["sound", "stepped"])
+def test_s_is_near_its_nominal_value_until_it_changes(behaviour: Behaviour) -> None:
+    truth = Story("s0", behaviour, [1, 4]).truth(0)
+    np.testing.assert_allclose(truth.sensitivity / NOMINAL, np.eye(3), atol=0.1)
 
 
 @pytest.mark.one_case

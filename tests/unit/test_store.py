@@ -9,13 +9,14 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from agent.core.events import CalibrationUpdate, StatusChange
 from agent.core.memory import MOST_MEMORIES, Memory
-from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
+from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError, connect_read_only
 from agent.delivery.store import WAITING_MAX, Store
 from agent.recording.continuation import UNKEPT_MAX
 
@@ -288,3 +289,13 @@ def test_a_directory_that_cannot_be_written_is_one_clear_line(tmp_path: Path) ->
 def test_no_store_is_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no such file"):
         History(tmp_path / FILE_NAME)
+
+
+def test_a_directory_that_cannot_be_written_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever may only read cannot make the files beside the store that SQLite wants for it."""
+    Store(tmp_path, 0).close()
+    before = sorted(path.name for path in tmp_path.iterdir())
+    monkeypatch.setattr("agent.delivery.history.os.access", lambda *_: False)
+    with closing(connect_read_only(tmp_path / FILE_NAME)) as connection:
+        assert connection.execute("select count(*) from sqlite_master").fetchone()[0] > 0
+        assert sorted(path.name for path in tmp_path.iterdir()) == before

@@ -159,6 +159,7 @@ def test_bits_that_are_read_wrongly_are_told() -> None:
     assert said.startswith(
         "s: single samples are off by a power of two (a bit is read wrongly: check cable and bus), 1"
     )
+    assert fed(0.3 * flipped[:6000])[0].startswith("s: single samples are off by a power of two")  # steps of 0.3
     wrong = (np.abs(flipped - sound) > 2.0**12).reshape(-1, 100, 3).any(axis=1)  # larger than anything in the noise
     assert marked(flipped)[60:][np.asarray(wrong)[60:]].mean() > 0.9
     assert not marked(sound).any()
