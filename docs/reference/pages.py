@@ -174,8 +174,8 @@ def reasons() -> Iterator[str]:
         "find what the reason of a refused or held window means, and what to do",
         "Every reason that a running agent gives for a window that it does not use: in the log, on the terminal, on "
         "the fleet page, and in `reason` of the result `window`; the status says once the reason of the third window "
-        "that was refused in a row, that windows are used again, and each fault of the program. `#` stands for a number "
-        "or a name. The line `next:` says what stands under *do*. Settings are those of `[[channels]]` "
+        "that was refused in a row, that windows are used again, and each fault of the program. `#` stands for a "
+        "number or a name. The line `next:` says what stands under *do*. Settings are those of `[[channels]]` "
         "([configuration.md](configuration.md)); the [numbers](messages.md#result-window) of the window have each "
         "statistic beside its limit.",
     )
