@@ -40,6 +40,7 @@ def test_priors_at_zero_give_plain_method_3(seed, alphas):
     np.testing.assert_allclose(found, plain, rtol=0, atol=1e-9 * np.abs(plain).max())
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=SEEDS, unit=st.floats(1e-3, 1e5))
 def test_the_output_s_unit_scales_s_q_and_u(seed, unit):
@@ -53,6 +54,7 @@ def test_the_output_s_unit_scales_s_q_and_u(seed, unit):
     assert one.reasons == other.reasons == ()
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=SEEDS, order=st.permutations(range(3)))
 def test_output_axes_permute(seed, order):
@@ -69,6 +71,7 @@ def test_output_axes_permute(seed, order):
     np.testing.assert_allclose(np.sqrt(np.diag(other.covariance)[:12]), u[rows], rtol=1e-6)
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=SEEDS, random=st.randoms(use_true_random=False))
 def test_the_order_of_windows_does_not_matter(seed, random):

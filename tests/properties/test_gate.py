@@ -81,6 +81,7 @@ class Site:
         return self.gate.hold("key") if kind == "hold" else self.gate.release("key")
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(settings_=gates, steps_=steps, calibrated=st.booleans())
 def test_nothing_goes_beyond_max_change_without_an_operator(
@@ -114,6 +115,7 @@ def test_from_a_data_sheet_it_goes_no_further_than_u_and_max_change(steps_: list
             assert within_max_change(site.in_force, calibration(), 100 * (1.1264 * 1.05 - 1), 12.0 + 3.4)
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(settings_=gates, seed=st.integers(0, 2**32 - 1), u_pct=st.sampled_from([0.5, 6.0]))
 def test_restored_at_any_event_it_goes_on_alike(settings_: GateSettings, seed: int, u_pct: float) -> None:

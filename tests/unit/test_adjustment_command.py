@@ -78,6 +78,7 @@ def _told(result: Result) -> dict:  # type: ignore[type-arg]
     return json.loads(result.stdout)  # type: ignore[no-any-return]
 
 
+@pytest.mark.slow
 def test_truth_lies_within_the_expanded_uncertainty(plain):
     told = _told(plain)
     assert plain.return_value == 0
@@ -103,6 +104,7 @@ def test_a_turned_static_sign_is_refused_with_status_3(session):
     assert told["sensitivity"] == [[None] * 3] * 3
 
 
+@pytest.mark.slow
 def test_a_contradicted_nominal_is_refused_with_numbers_and_tells_nothing_of_s(session):
     result = _run(session, "--nominal", "2", "--u-nominal-pct", "5", "--json", "-")
     told = _told(result)
@@ -199,6 +201,7 @@ def test_too_few_rests_are_refused(tmp_path):
     assert "10 rests" in result.stderr
 
 
+@pytest.mark.slow
 def test_the_table_ends_with_s_q_the_band_and_the_three_largest_sources(session, table):
     lines = table.splitlines()
     told = _told(_run(session, "--json", "-"))
@@ -231,6 +234,7 @@ def test_nuisances_are_shown_where_all_is_asked_for(session, table):
     assert all(len(line) <= 80 for line in table.splitlines()), table
 
 
+@pytest.mark.slow
 def test_a_parameter_that_the_prior_tells_has_its_posterior_and_a_star(session, tmp_path):
     files = [part for name in ("sensor", "reference", "poses") for part in (f"--{name}", str(session / f"{name}.csv"))]
     covariance = np.diag([1e-8] * 9 + [1.0] * 3).tolist()

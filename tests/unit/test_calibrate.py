@@ -145,6 +145,7 @@ def test_one_axis_gives_one_column(tmp_path: Path, capsys: pytest.CaptureFixture
     np.testing.assert_allclose(S[:, 0], bench.truth.sensitivity[:, 0], atol=3e-4 * 26_000)
 
 
+@pytest.mark.slow
 def test_knocks_stay_in_with_plain(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bench = files(tmp_path, replace(plain(7), knocks=Knocks(rate_hz=0.5)))
     status, found, _ = run(capsys, *arguments(tmp_path))
@@ -216,6 +217,7 @@ def no_number(path: Path) -> None:
     path.write_text("\n".join(rows) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "more", "message"),
     [

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 # A type is half resolved while msgspec runs Python to resolve it: for another type in it, a pattern, the hash of a
 # Literal. What Python runs for the annotations of the type itself comes before other threads see it.
 FIND = """
@@ -46,6 +48,7 @@ BY_ONE_THREAD = {  # that reads a recording; and what an audit tells
 }
 
 
+@pytest.mark.slow
 def test_types_that_threads_decode_are_resolved_by_an_import() -> None:
     found = subprocess.run([sys.executable, "-c", FIND], capture_output=True, text=True, check=True, timeout=60)
     names = {name.split(".", 2)[2] for name in found.stdout.split() if name.startswith("agent.")}

@@ -253,6 +253,7 @@ def test_what_the_state_has_followed_is_stable_again() -> None:
     assert again.test.result()[SYY].statistic == 0.0  # what was is forgotten: no half of a threshold to begin with
 
 
+@pytest.mark.slow
 def test_cost_and_memory_stay_bounded() -> None:
     onsets = Onsets(12)
     lengths = {}

@@ -30,6 +30,7 @@ def polls(rate_hz: float, seconds: float, seed: int) -> Iterator[tuple[float, fl
         yield t_s, half_s, int(true_hz * (read_s + 1e-6 * read_s**2 / 2))  # drifts by 0.1 % in a quarter of an hour
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [31.25, 62.5, 125.0, 500.0, 1000.0, 4000.0])
 @pytest.mark.parametrize("seed", range(10))
 def test_one_sample_that_is_taken_is_told_within_two_seconds(rate_hz: float, seed: int) -> None:

@@ -90,6 +90,7 @@ def test_copies_that_are_on_the_bus_in_turns_are_told_and_a_restart_is_not(site:
         assert "; runs one, another have given" in why()
 
 
+@pytest.mark.slow
 def test_a_copied_card_is_told_to_the_second_gateway_to_consumers_and_on_the_page(
     site: Site, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

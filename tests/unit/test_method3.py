@@ -79,6 +79,7 @@ def test_covariance_is_that_of_the_regression() -> None:
     np.testing.assert_allclose(solve(windows).covariance, cov[np.ix_(order, order)], rtol=1e-8, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_white_noise_covers() -> None:
     # 400 recordings, 12 parameters: z-scores have unit variance; chi-squared over 4800 (correlated within a recording,
     # at worst 400 * 3 independent): 99.9 % band of 1200 degrees of freedom is 0.871..1.139.

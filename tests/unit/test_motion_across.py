@@ -117,6 +117,7 @@ def test_outputs_that_are_copies_are_no_motion_across() -> None:
     assert "the sensor is turned against what was stated" in told.reasons[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("across", [0.5, 1.5])
 def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(across: float) -> None:
     """What it moves across follows what it moves along differently in each octave, by its modes. S is off by 3 % in
@@ -132,6 +133,7 @@ def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(a
         assert "was taken out of output z" in told.warnings[0]
 
 
+@pytest.mark.slow
 def test_one_mode_alone_tells_s_along_only_as_well_as_transverse_sensitivities_are_known() -> None:
     """x moves half as much as z, and only with it: V_z shows S_zz + 0.5 S_zx."""
     for seed in range(6):

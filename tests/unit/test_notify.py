@@ -52,6 +52,7 @@ def test_what_is_said_arrives(systemd: Receiver) -> None:
     assert systemd.told() == ["READY=1", "STATUS=running: all is well", "STATUS=" + "x" * STATUS_MAX, "STOPPING=1"]
 
 
+@pytest.mark.slow
 def test_the_watchdog_is_fed_as_often_as_it_needs_and_only_when_fed(systemd: Receiver) -> None:
     notifier = SystemdNotifier(
         {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "400000", "WATCHDOG_PID": str(os.getpid())}

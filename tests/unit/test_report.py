@@ -281,6 +281,7 @@ CASES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_bad_input_is_one_line_and_status_2(
     recorded: tuple[Path, Truth], tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str

@@ -78,6 +78,7 @@ def in_window(band: int, by: float, sensors: slice = slice(None)) -> Array:
     return fallen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("band", [1, 3])
 def test_a_frequency_that_falls_at_all_sensors_is_the_structure(band: int) -> None:
     found = after(10, in_window(band, 0.02))
@@ -114,6 +115,7 @@ def test_a_frequency_that_fewer_than_three_sensors_see_is_not_told(see: int) -> 
     assert len(result(watch).frequencies) == (see >= 3)
 
 
+@pytest.mark.slow
 def test_sensors_that_see_another_mode_in_the_window_do_not_hide_the_change() -> None:
     """Of six, four see a mode that falls by 2 %, and two another one 9 % below it that stays."""
     site, watch = Frequencies(7), SiteWatch(GATEWAY, BANDS_HZ)
@@ -147,6 +149,7 @@ def test_a_sensor_that_changes_at_another_time_is_still_named() -> None:
     assert found.least_detectable[0, 0] > after(40).least_detectable[0, 0], "two bands do not count"
 
 
+@pytest.mark.slow
 def test_a_visit_does_not_touch_frequencies() -> None:
     site, watch = Frequencies(3), SiteWatch(GATEWAY, BANDS_HZ)
     for k in range(60):

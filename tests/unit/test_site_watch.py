@@ -256,6 +256,7 @@ def test_a_noise_floor_that_doubles_is_noise(learned: tuple[Site, SiteWatch]) ->
     assert abs(found.sensors[5].size - (2**0.5 - 1)) < found.sensors[5].U
 
 
+@pytest.mark.slow
 def test_noise_that_a_sensitivity_moves_is_not_told(learned: tuple[Site, SiteWatch]) -> None:
     """2 % more noise, steady to 0.1 % so that it is sure: a sensitivity moves the noise alike."""
     site, watch = copy.deepcopy(learned[0]), SiteWatch(GATEWAY, BANDS_HZ)

@@ -106,6 +106,7 @@ def _nested(depth: int) -> bytes:
     return msgspec.msgpack.encode({"version": VERSION, "state": {"a": content}})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "forged",
     [
