@@ -32,11 +32,10 @@ class QuietHours:
             return
         # Rounding is noise as well, which a device that rests in one digit does not show.
         density = np.maximum(density, least_step(values) / np.sqrt(12.0) / np.sqrt(0.5 * rate_hz))
-        hours = self._of.setdefault(device, {})
-        hour = int(np.floor(day * HOURS_A_DAY))
-        hours[hour] = np.minimum(hours.get(hour, density), density)
-        for old in sorted(hours)[:-HOURS]:
-            del hours[old]
+        hours, hour = self._of.setdefault(device, {}), int(np.floor(day * HOURS_A_DAY))
+        hours[hour] = np.minimum(hours.pop(hour, density), density)  # the newest is the last, also if days begin anew
+        while len(hours) > HOURS:
+            del hours[next(iter(hours))]
 
     def most_noise(self, device: str) -> tuple[float, ...]:
         """The lowest density of each channel in the last hours; () where no window told one."""
