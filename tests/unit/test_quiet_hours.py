@@ -77,7 +77,7 @@ def test_more_noise_counts_after_a_day_and_that_of_another_device_at_once() -> N
         hours.update("r", 0.5 + hour / 24.0 + 1e-3, 3.0 * still, RATE_HZ)
     np.testing.assert_allclose(hours.most_noise("r"), 3.0 * DENSITY, rtol=0.05)
     for hour in range(HOURS):  # another sensor beside it, whose days begin anew
-        hours.update("r", hour / 24.0 - 2.0, 9.0 * still, RATE_HZ)
+        hours.update("r", hour / 24.0 - 2.0 + 1e-3, 9.0 * still, RATE_HZ)
     np.testing.assert_allclose(hours.most_noise("r"), 9.0 * DENSITY, rtol=0.05)
     hours.forget("r")
     assert hours.most_noise("r") == ()
