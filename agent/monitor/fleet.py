@@ -580,7 +580,7 @@ def _largest_u(calibration: Mapping[str, Any]) -> tuple[float | None, str]:
 
 def _main_u(calibration: Mapping[str, Any]) -> dict[int, float]:
     """U of each main sensitivity in % of it, by its index in PARAMETERS, where it is known."""
-    values, u, k = calibration["sensitivity"], calibration["standard_uncertainty"], calibration["coverage_factor"]
+    values, u, k = calibration["sensitivity"], calibration["standard_uncertainty"], _coverage_factor(calibration)
     found = {i: 100.0 * k * u[i] / abs(s) for i in MAIN if (s := values[i // 3][i % 3]) and u[i] is not None}
     return {i: pct for i, pct in found.items() if math.isfinite(pct)}
 
@@ -607,4 +607,11 @@ def _in_u(drift: dict[str, Any], calibration: Mapping[str, Any]) -> float:
     if drift["verdict"] == "drifting" and calibration:
         change = max(change, rate * (calibration["t_utc_ns"] - drift["onset_utc_ns"]) / DAY_NS)
     u = calibration["standard_uncertainty"][PARAMETERS.index(drift["parameter"])] if calibration else None
-    return min(change / (calibration["coverage_factor"] * u), LARGEST) if u else 0.0
+    expanded = _coverage_factor(calibration) * u if u else math.nan
+    return min(change / expanded, LARGEST) if expanded > 0.0 else 0.0
+
+
+def _coverage_factor(calibration: Mapping[str, Any]) -> float:
+    """k of a result; NaN where it tells none, as a result of a stranger may."""
+    k = calibration["coverage_factor"]
+    return k if k is not None and k > 0.0 else math.nan

@@ -58,6 +58,13 @@ def test_u_has_the_coverage_factor_of_the_result() -> None:
     assert row["verdicts"][0]["u_change"] == 4.0
 
 
+@pytest.mark.parametrize("k", [0.0, -2.0, np.nan])
+def test_a_result_without_a_coverage_factor_tells_no_u(k: float) -> None:
+    step = DriftVerdict("Syy", "stepped", 360.0, 4.0, np.nan, np.nan, 0.0, 20.0, 15.0, "Syy stepped")
+    row = row_of(status(2), msgspec.structs.replace(calibration(1), coverage_factor=k), told(step))
+    assert (row["u_pct"], row["size_in_u"]) == (None, 0.0)
+
+
 def test_what_is_stated_of_a_net_change_is_no_u_of_it() -> None:
     verdict = net_change()
     earlier = replace(verdict, u_change=0.05, u_rate=0.01)  # as engines to 22 told it

@@ -69,7 +69,7 @@ def agrees(found: SensorFile, times_s: np.ndarray, values: np.ndarray, resolutio
     np.testing.assert_allclose(found.time_s[:], times_s, rtol=0, atol=atol)
 
 
-@pytest.mark.one_case
+@pytest.mark.slow
 @pytest.mark.parametrize("head", HEADS, ids=[head.source for head in HEADS])
 def test_heads(head: Head, tmp_path: Path) -> None:
     text = head.head + "".join(f"{row}\r\n" for row in rows(head.row, head.step_s))
@@ -254,7 +254,7 @@ FAULTS = (no_end, cut_line, zeros_behind, zeros_within, no_time, missing_cells, 
           utf16, byte_order_mark, fortran, delimiters_at_the_end, thousands, a_word, a_field_less)  # fmt: skip
 
 
-@pytest.mark.one_case
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 @pytest.mark.parametrize(
     "dialect", [pytest.param(d, marks=[pytest.mark.thorough] * (k % 3 > 0)) for k, d in enumerate(DIALECTS)]

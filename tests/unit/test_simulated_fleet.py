@@ -302,7 +302,7 @@ def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: P
         assert sorted(times.values()) == [k * 100_000_000 for k in range(5)]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_process_that_ends_is_told(site: Site, tmp_path: Path) -> None:
     with FleetProcesses(FleetPlan(2, 1, 1, [site.endpoint], tmp_path)) as fleet:
         os.kill(fleet.pids()[0], signal.SIGKILL)

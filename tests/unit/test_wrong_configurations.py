@@ -458,7 +458,7 @@ def test_the_sound_ones_are_good(sound: str, tmp_path: Path, capsys: pytest.Capt
     assert (status, good) == (0, True), said
 
 
-@pytest.mark.one_case
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SYNTAX, *VALUES, *PLANS, *DOUBTED, *WARNED])
 def test_a_mistake_is_told_and_its_remedy_makes_the_file_good(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

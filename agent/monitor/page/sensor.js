@@ -96,12 +96,15 @@ function drawResponse(newest) {
 
 // --- what stands beside the plots
 
+// k of a result; NaN where it tells none, as a result of a stranger may.
+const coverageFactor = (newest) => (newest?.coverage_factor > 0 ? newest.coverage_factor : NaN);
+
 function showMatrix(newest, row, trends) {
   $("matrix-title").replaceChildren(text(newest ? `S in force, ${clean(newest.output_unit)} per m/s²` : "S in force"));
   if (!newest) { $("matrix").replaceChildren(make("p", "No calibration is in force.")); return; }
   const moved = new Set((row?.verdicts ?? []).map((v) => v.parameter));
   const cell = (i) => {
-    const U = newest.coverage_factor * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "", silent = over && Math.abs(change.change) > change.U && !moved.has(NAMES[i]);
+    const U = coverageFactor(newest) * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "", silent = over && Math.abs(change.change) > change.U && !moved.has(NAMES[i]);
     const known = newest.determined[i] ? [] : [make("small", "by the prior")];
     const stays = moved.has(NAMES[i]) && (row.status === "HELD" || over === "0.0 U"); // windows tell a change, and S in force stays
     return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(stays ? [make("small", "not in force")] : over ? [make("small", `moved ${over}${silent ? `, ${unjudged(trends)[0]}` : ""}`, silent ? { title: unjudged(trends)[1] } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
@@ -116,7 +119,7 @@ function showMatrix(newest, row, trends) {
 function showBudget(newest, row, trends) {
   const sources = Object.entries(trends.budget ?? {}), of = row?.verdicts[0]?.parameter, k = Math.max(0, MAIN.map((i) => NAMES[i]).indexOf(of)), name = NAMES[MAIN[k]];
   const total = sources.reduce((sum, [, u]) => sum + u[k] ** 2, 0), scale = newest ? Math.abs(value(newest, MAIN[k])) : 0;
-  $("budget-title").replaceChildren("What makes U of ", symbol(name), total > 0 && scale ? ` (${two((100 * newest.coverage_factor * Math.sqrt(total)) / scale)} %)` : "");
+  $("budget-title").replaceChildren("What makes U of ", symbol(name), total > 0 && scale ? ` (${two((100 * coverageFactor(newest) * Math.sqrt(total)) / scale)} %)` : "");
   if (!(total > 0)) { $("budget").replaceChildren(make("p", ["The newest result does not say it. On the gateway: ", make("code", `fieldcal show --budget ${newest ? newest.sequence : "NUMBER"}`)], { class: "hint" })); return; }
   const shares = sources.map(([source, u]) => [source, u[k] ** 2 / total]).sort((a, b) => b[1] - a[1]), small = shares.filter(([, s]) => s < BUDGET_LEAST);
   const rest = small.length ? [[`${small.length} others`, small.reduce((sum, [, s]) => sum + s, 0)]] : [];
@@ -165,7 +168,7 @@ function showEvents(statuses, drifts, estimates) {
 // --- what is folded below
 
 function responseSection(newest) {
-  const bands = newest?.response ?? [], k = newest?.coverage_factor;
+  const bands = newest?.response ?? [], k = coverageFactor(newest);
   const rows = bands.map((b) => [band([b.low_hz, b.high_hz]), ...AXES.map((_, i) => `${plusMinus(b.sensitivity_re[i][i], k * b.standard_uncertainty[i][i])}, imaginary ${rounded(b.sensitivity_im[i][i], k * b.standard_uncertainty[i][i])}`)]);
   return bands.length ? fold(`Response over frequency; S holds at ${short(newest.reference_frequency_hz)} Hz`, table("Response over frequency", ["Band", "Sxx", "Syy", "Szz"], rows)) : [];
 }
