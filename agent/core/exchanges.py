@@ -221,7 +221,7 @@ def _of_another_reference(record: Record, back: Array) -> Record:
     every, pose = np.kron(np.eye(record.channels // len(back)), back), record.pose
     whole, forth = np.kron(np.eye(2), every), np.linalg.inv(every)
     ways, root = np.linalg.qr(record.root @ whole.T)
-    turn = pose.direction @ back @ np.linalg.pinv(pose.direction)  # of the motion in the sensor's frame
+    turn = pose.direction @ every @ np.linalg.pinv(pose.direction)  # of the motion in the sensor's frame
     only = turn / np.abs(np.linalg.det(back)) ** (1.0 / len(back))
     return replace(
         record, root=root, slopes=ways.T @ record.slopes, passed=ways.T @ record.passed @ every.T,

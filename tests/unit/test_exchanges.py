@@ -16,10 +16,14 @@ from agent.core.exchanges import Exchange
 from agent.core.hypotheses import possible_jump
 from agent.core.snapshot import pack, unpack
 from benchmarks.exchanges import BEFORE, CASES, EYE, LEVELS, changed, explained, record_of, settled
-from calib.model import Array
+from calib.excitation.front_end import windows_of
+from calib.model import Array, Pose
+from calib.signal.instrument import Instrument
+from calib.windows.record import Record
 from tests.building_windows import building_window
 from tests.clamp_windows import Q_TRUE, S_TRUE
 from tests.unit.test_estimation import actions, channel_of, estimation, hours
+from tests.unit.test_holes import SPAN_S, pair
 
 HELD = 3  # windows that confirm a change
 UTC_NS = 1_790_000_000_000_000_000  # 2026-09-21 14:13 UTC
@@ -46,6 +50,21 @@ def held(*causes: Exchange) -> tuple[Estimation, str]:
         if judged.decision.proposal is not None:
             found.gate.published(100 + k)
     return found, found.explain((BEFORE + HELD) / 24 * DAY_S, UTC_NS)
+
+
+def test_an_ac_coupled_reference_in_another_unit_is_undone_with_its_integral() -> None:
+    """Before, held windows beside an AC-coupled reference ended the estimation of the channel."""
+    sensor, reference = pair(1, "")
+    poses, found = Pose("beside", np.eye(3), np.zeros(3)), []
+    for factor in (1.0, 0.5):
+        u = replace(reference, values=factor * reference.values)
+        [window] = windows_of(poses, sensor, u, Instrument(corner_hz=0.05), SPAN_S)
+        found.append(Record.of(window, 0.0))
+    whole, halved = found
+    assert halved.channels == 6
+    undone = Exchange(0.5 * EYE, "reference").undone(halved, np.eye(3), np.zeros(3))
+    for one, other in ((undone.slopes, whole.slopes), (undone.root, whole.root), (undone.mean_x, whole.mean_x)):
+        assert np.abs(one) == pytest.approx(np.abs(other), rel=1e-6, abs=1e-6 * np.abs(other).max())
 
 
 def after(found: Estimation, windows: list[Any]) -> list[str]:
