@@ -82,7 +82,9 @@ def windows_in(
     try:
         sensor, reference = _cut(span_s, channel, streams)
         found = made(None)
-        if any(share_above(window.bands, HIGHEST * to_hz) > ABOVE for window in found):
+        # Above, a response that is taken out is none of the instruments: least squares would fit S to what it makes.
+        most = ABOVE if response.is_flat else 0.0
+        if any(share_above(window.bands, HIGHEST * to_hz) > most for window in found):
             motion_hz = motion_band_hz(found, lasting=True)
             found = [replace(window, motion_hz=motion_hz) for window in made(to_hz)]
     except Unusable as error:

@@ -7,7 +7,15 @@ import numpy as np
 from calib.excitation.detection import moving_share
 from calib.excitation.turning import feels_gravity
 from calib.model import U_NOISE, Array
-from calib.signal.band import STOP_BAND, band_above_noise, noise_in_bands, power_share_above, quietest
+from calib.signal.band import (
+    STOP_BAND,
+    UNFOLDED,
+    band_above_noise,
+    folds,
+    noise_in_bands,
+    power_share_above,
+    quietest,
+)
 from calib.signal.instrument import Instrument
 from calib.signal.resampling import BAND, DIFFERENTIATED_BAND_HZ, differentiated_band_hz
 
@@ -91,16 +99,23 @@ def _limit_hz(
     """Where to limit both signals so that the sensor shows no motion that the reference cannot tell.
 
     None where the sensor shows no such motion. `found_hz`: the upper end of the reference's motion, None where nobody
-    knows it. A reference as fast as the sensor, and not differentiated, tells all up to BAND of its rate.
+    knows it. A reference as fast as the sensor, and not differentiated, tells all up to BAND of its rate; a faster one
+    up to UNFOLDED of the sensor's.
     """
     rate_hz, sensor_rate_hz = rates_hz
-    if not instrument.derivatives and rate_hz > AS_FAST * sensor_rate_hz:
-        if found_hz is not None or (raw.shape[1] == 3 and feels_gravity(raw[np.isfinite(raw).all(axis=1)])):
-            return None  # with a reference that feels gravity, rests count: a filter costs their ends
+    folded, slower = folds(rate_hz, sensor_rate_hz), rate_hz <= AS_FAST * sensor_rate_hz
+    ends_hz = [UNFOLDED * sensor_rate_hz] if folded else []
+    if instrument.derivatives or slower:
+        ends_hz.append(differentiated_band_hz(rate_hz) if instrument.derivatives else BAND * rate_hz)
+    elif found_hz is not None and not (folded and found_hz > ends_hz[0]):
+        return None
+    elif raw.shape[1] == 3 and feels_gravity(raw[np.isfinite(raw).all(axis=1)]):
+        return None  # with a reference that feels gravity, rests count: a filter costs their ends
+    elif not folded:
         share = power_share_above(raw, rate_hz, BAND * rate_hz)
         wide = share > TOO_FAST and share * float(np.nanvar(raw, axis=0).sum()) > LEAST_MOTION_MPS2**2
         return BAND * rate_hz / STOP_BAND if wide else None
-    right_hz = differentiated_band_hz(rate_hz) if instrument.derivatives else BAND * rate_hz
+    right_hz = min(ends_hz)
     felt_hz, _ = band_above_noise(V, sensor_rate_hz)
     if felt_hz is not None and felt_hz <= right_hz:
         return None

@@ -59,6 +59,14 @@ def moving(u: Array, rate_hz: float, noise: Array) -> list[Stretch]:
     return _stretches(_bridged(on, round(BRIDGE_S / FRAME_S)), size * width, len(u))
 
 
+def half_period_s(x: Array, rate_hz: float) -> float:
+    """Time between two changes of sign of the strongest channel of x (n, m), on average; inf where there is none."""
+    strongest = x[:, int(np.argmax(np.var(x, axis=0)))]
+    slow = averaged(strongest[:, None], max(1, round(FRAME_S * rate_hz)))[:, 0]
+    changes = np.count_nonzero(np.diff(np.signbit(slow - slow.mean()))) if len(slow) else 0
+    return len(x) / rate_hz / changes if changes else np.inf
+
+
 def knocked(V: Array, basis: Array, finest: Array) -> tuple[Mask, Array]:
     """Flags (n,) of knocks: points whose residual from the regression of V (n, 3) on `basis` (n, p) is above five
     robust SDs; and the residuals (n, 3) of all points from the regression of the other points.

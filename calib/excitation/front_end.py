@@ -24,7 +24,7 @@ from calib.excitation.turning import feels_gravity, is_turned, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, disproportionate
 from calib.excitation.windows import CALM, Points, at_rest, motion_windows, rest_window, still_window
 from calib.model import U_NOISE, Array, BandSums, Pose, Window, WindowSums, own_channels
-from calib.signal.band import band_above_noise, lowpass, without_short_holes, without_slow
+from calib.signal.band import band_above_noise, folds, lowpass, unfolded, without_short_holes, without_slow
 from calib.signal.corner import integral, with_integral, without_corner
 from calib.signal.glitches import glitches
 from calib.signal.holes import Mask
@@ -191,18 +191,11 @@ def aligned(
     rates_hz, together = (rate_hz, sensor_rate_hz), columns[np.isfinite(columns).all(axis=1) & inside, : 3 + m]
     most = np.array(settings.most_noise) if settings.most_noise else np.full(m, np.inf)
     band_hz, noise, u_noise = band_to_keep(raw, u, V, instrument, rates_hz, noise_hz, settings.to_hz, together, most)
-    clipped, independent, unfiltered = 0, 1.0, as_measured.columns if struck.any() else columns
-    if band_hz is not None and settings.limit_band:
-        independent = min(1.0, 2.0 * FILTER_BAND * band_hz / sensor_rate_hz)
-        columns = lowpass(columns, sensor_rate_hz, band_hz)
-    else:
+    clipped, unfiltered = 0, as_measured.columns if struck.any() else columns
+    filters_to_hz = band_hz if settings.limit_band else None
+    if filters_to_hz is None:
         columns[filled] = np.nan  # without a filter, a filled sample would only repeat what the others tell
-    if settings.from_hz and settings.limit_band:
-        columns = without_slow(columns, sensor_rate_hz, settings.from_hz)
-        independent = max(independent - 2.0 * settings.from_hz / sensor_rate_hz, 0.0)
-    if against is not None:
-        columns = against.passed(np.where(inside[:, None], columns, np.nan))  # beyond, the sensor may be turned
-        independent = against.independent(FILTER_BAND * band_hz if settings.limit_band and band_hz else np.inf)
+    columns, independent = _filtered(columns, sensor_rate_hz, filters_to_hz, settings, inside, against)
     if columns is not unfiltered:
         clipped = _clipped(unfiltered[np.isfinite(unfiltered).all(axis=1) & inside & ~filled])
     usable = np.isfinite(columns).all(axis=1) & inside
@@ -222,12 +215,32 @@ def aligned(
     if u_noise > U_NOISE and not settings.limit_band:  # Method 3 as printed
         noise = np.zeros_like(noise)
     noise = noise if against is None else against.reference_noise
-    noise = not_more_than_incoherent(noise, points.u[:, :m], points.V, sensor_rate_hz, instrument.derivatives)
+    if settings.limit_band and u_noise <= U_NOISE:
+        points = points._replace(most_noise=noise[0])
+    noise = not_more_than_incoherent(noise, points.own_u, points.V, sensor_rate_hz, instrument.derivatives)
     told = {name: float(count) for name, count in counts.items() if count}
     sensor_noise = np.sqrt(0.5 * sensor_rate_hz) * band_above_noise(V, sensor_rate_hz)[1]
     return Aligned(
-        points, noise, u_noise, sensor_noise, clipped, independent, band_hz if settings.limit_band else None, told
+        points, noise, u_noise, sensor_noise, clipped, independent, filters_to_hz, told
     )  # fmt: skip
+
+
+def _filtered(
+    columns: Array, rate_hz: float, to_hz: float | None, settings: Settings, inside: Mask, against: NoiseFilter | None
+) -> tuple[Array, float]:
+    """The columns (n, k) after the filters that sensor and reference both pass, and the share of the points that these
+    leave independent. `to_hz`: the band of the motion, None where nothing is filtered above it."""
+    independent = 1.0
+    if to_hz is not None:
+        independent = min(1.0, 2.0 * FILTER_BAND * to_hz / rate_hz)
+        columns = lowpass(columns, rate_hz, to_hz)
+    if settings.from_hz and settings.limit_band:
+        columns = without_slow(columns, rate_hz, settings.from_hz)
+        independent = max(independent - 2.0 * settings.from_hz / rate_hz, 0.0)
+    if against is not None:
+        columns = against.passed(np.where(inside[:, None], columns, np.nan))  # beyond, the sensor may be turned
+        independent = against.independent(FILTER_BAND * to_hz if to_hz else np.inf)
+    return columns, independent
 
 
 class _Beside(NamedTuple):
@@ -261,12 +274,13 @@ def _side_by_side(
     if instrument.has_corner:
         u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
-    u = passed(instrument.known.passed(u, rate_hz), rate_hz, response)
+    u = unfolded(passed(instrument.known.passed(u, rate_hz), rate_hz, response), rate_hz, sensor_rate_hz)
     at = resample(u, reference.clock, sensor.time_s - lag_s, reference.first_index, lost)
     k, rows = u.shape[1], np.empty((3 + 2 * u.shape[1], len(V)))  # here and in what is kept: a channel is a row
     rows[:3], rows[3 : 3 + k], rows[3 + k :] = V.T, at.u.T, at.du.T
     rows[:, ~at.usable] = np.nan
-    return _Beside(rows.T, raw, at.u[at.usable][:, :m], V, raw_filled, filled, at.noise_hz)
+    noise_hz = np.minimum(at.noise_hz, 0.5 * sensor_rate_hz) if folds(rate_hz, sensor_rate_hz) else at.noise_hz
+    return _Beside(rows.T, raw, at.u[at.usable][:, :m], V, raw_filled, filled, noise_hz)
 
 
 def nothing_in(pose: Pose, start_s: float, stop_s: float, reason: str) -> Window:

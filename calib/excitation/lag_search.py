@@ -77,7 +77,7 @@ def misfit_by_lag(
     both = np.fft.irfft(np.vstack([left, there * there.conj()]), FINER * length, axis=1)
     k = np.arange(-FINER * size, FINER * size + 1)
     mean_square = both[0, k] / both[1, k]
-    least = max(float(mean_square.min()), np.finfo(float).tiny)
+    least = max(float(mean_square.min()), np.finfo(float).eps * float(mean_square.max()), np.finfo(float).tiny)
     return k / (FINER * rate_hz), 3.0 * len(V) * mean_square / least
 
 

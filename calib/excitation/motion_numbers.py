@@ -12,20 +12,18 @@ from calib.windows.sums import factor
 
 
 def motion_numbers(
-    sums: WindowSums, basis: Array, V: Array, rate_hz: float, stepped: tuple[float, float], limits: Limits,
-    noise: Array | None = None,
+    sums: WindowSums, basis: Array, V: Array, rate_hz: float, stepped: tuple[float, float], limits: Limits, noise: Array
 ) -> dict[str, float]:  # fmt: skip
     """Statistics for the verdict: level, noise and coherence in the band of the motion, drift and step of the mean.
 
-    `basis` (n, 1 + 2 m) is [1, u, du]; `stepped` is a step and its standard uncertainty in output unit. `noise` (m,) is
-    the SD of the white noise in u, None where nobody has found it yet. A motion that fills the spectrum looks like
-    white noise: what of it the sensor shows as well is none.
+    `basis` (n, 1 + 2 m) is [1, u, du]; `stepped` is a step and its standard uncertainty in output unit. `noise` (k,) is
+    the SD of the white noise in u of the reference's own channels. A motion that fills the spectrum looks like white
+    noise: what of it the sensor shows as well is none.
     """
-    u = basis[:, 1 : 1 + sums.reference_channels]
-    noise = detection.white_noise(u) if noise is None else noise
     numbers, scale = _in_band(basis, V, rate_hz, noise)
     if numbers["reference_rms_mps2"] <= limits.least_level * numbers["reference_noise_mps2"]:
-        numbers, scale = _in_band(basis, V, rate_hz, np.minimum(noise, detection.incoherent(u, V)))
+        incoherent = detection.incoherent(basis[:, 1 : 1 + len(noise)], V)
+        numbers, scale = _in_band(basis, V, rate_hz, np.minimum(noise, incoherent))
     drifted, u_drift = _drift(sums)
     changes = {"drift_mps2": drifted, "step_mps2": stepped[0], "u_step_mps2": stepped[1]}
     if scale > 0 and DRIFT_SD * u_drift > limits.most_drift_mps2 * scale:  # else it changes no verdict
@@ -34,7 +32,7 @@ def motion_numbers(
 
 
 def _in_band(basis: Array, V: Array, rate_hz: float, noise: Array) -> tuple[dict[str, float], float]:
-    """Level of the reference, its `noise` (m,) and the coherence, after averages that leave most of the motion; and the
+    """Level of the reference, its `noise` (k,) and the coherence, after averages that leave most of the motion; and the
     largest sensitivity of V to it, in output unit per m/s2."""
     m = len(noise)
     u = basis[:, 1 : 1 + m]

@@ -41,7 +41,8 @@ class Points(NamedTuple):
 
     `time_s` (n,) rises; `V` (n, 3) in output unit; `u` (n, m) in m/s2 and its derivative `du` (n, m) in m/s3. `struck`
     (n,) flags samples that are known to be knocks: in V is what the motion explains in their places. None where none
-    are known.
+    are known. `most_noise` (m,): the SD that the reference's white noise in u does not exceed, as its own samples tell;
+    None where they do not.
     """
 
     time_s: Array
@@ -49,15 +50,27 @@ class Points(NamedTuple):
     u: Array
     du: Array
     struck: NDArray[np.bool_] | None = None
+    most_noise: Array | None = None
 
     def at(self, which: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Points:
         """Some of the samples."""
         struck = None if self.struck is None else self.struck[which]
-        return Points(self.time_s[which], self.V[which], self.u[which], self.du[which], struck)
+        return Points(self.time_s[which], self.V[which], self.u[which], self.du[which], struck, self.most_noise)
 
     def part(self, first: int, stop: int) -> Points:
         """The samples [first, stop)."""
         return self.at(slice(first, stop))
+
+    @property
+    def own_u(self) -> Array:
+        """(n, k) u of the reference's own channels, without their integrals (calib.signal.corner)."""
+        return self.u[:, : own_channels(self.u.shape[1])]
+
+    def not_noisier(self, found: Array) -> Array:
+        """(k,) SD of the white noise of the reference's own channels in u, of which the samples of all channels seem to
+        have `found` (m,)."""
+        found = found[: self.own_u.shape[1]]
+        return found if self.most_noise is None else np.minimum(found, self.most_noise)
 
     def within(self, start_s: float, stop_s: float) -> Points:
         """The samples from one time to another, both included."""
@@ -78,7 +91,7 @@ def motion_windows(
     seen = points if before is None else before
     noise, windows = detection.white_noise(seen.u), []
     for kind, first, stop in motion_parts(seen.u, _rate(seen.time_s), noise):
-        known = noise if stop - first == len(points.u) and before is None else None
+        known = points.not_noisier(noise) if stop - first == len(points.u) and before is None else None
         part = points.within(seen.time_s[first], seen.time_s[stop - 1])
         windows += judged(kind, pose, part, limits, leave_out=leave_out, taper=taper, noise=known)
     return windows
@@ -87,9 +100,14 @@ def motion_windows(
 def motion_parts(u: Array, rate_hz: float, noise: Array) -> list[tuple[Kind, int, int]]:
     """Parts (kind, first, stop) of a reference's samples u (n, m), cut where it begins or stops to move.
 
+    Waves of seconds are calm at each change of sign, for longer than a pause may be. The integrals of a reference
+    (calib.signal.corner) show hardly anything but the waves: its own channels tell as well, then.
     `noise` (m,) is the SD of its white noise. Pauses shorter than SHORTEST_QUIET_S make no part.
     """
-    edges = [0, *itertools.chain(*detection.moving(u, rate_hz, noise)), len(u)]
+    m, stretches = own_channels(u.shape[1]), detection.moving(u, rate_hz, noise)
+    if m < u.shape[1] and detection.half_period_s(u[:, :m], rate_hz) > detection.BRIDGE_S:
+        stretches = _either(stretches, detection.moving(u[:, :m], rate_hz, noise[:m]))
+    edges = [0, *itertools.chain(*stretches), len(u)]
     parts: list[tuple[Kind, int, int]] = []
     for k, (first, stop) in enumerate(itertools.pairwise(edges)):
         if k % 2:
@@ -97,6 +115,17 @@ def motion_parts(u: Array, rate_hz: float, noise: Array) -> list[tuple[Kind, int
         elif stop - first >= SHORTEST_QUIET_S * rate_hz or len(edges) == 2:
             parts.append(("quiet", first, stop))
     return parts
+
+
+def _either(one: list[detection.Stretch], other: list[detection.Stretch]) -> list[detection.Stretch]:
+    """What lies in a stretch of either list."""
+    found: list[detection.Stretch] = []
+    for first, stop in sorted([*one, *other]):
+        if found and first <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], stop)
+        else:
+            found.append((first, stop))
+    return found
 
 
 def judged(
@@ -175,7 +204,7 @@ def still_window(pose: Pose, points: Points, limits: Limits = DEFAULT_LIMITS, *,
         numbers = {"points": float(len(points.V)), "left_out_pct": 0.0}
         return _window("rest", pose, points.time_s, sums, _never(numbers), 0)
     resting = np.concatenate([np.arange(a, b) for a, b in rests])
-    t, V, u, du, known = points.at(resting)
+    t, V, u, du, known, _ = points.at(resting)
     struck, _ = detection.knocked(np.asfortranarray(V), np.ones((len(V), 1)), detection.least_step(V))
     struck = struck if known is None else struck | known
     kept = ~struck if leave_out else np.ones(len(V), dtype=bool)
@@ -230,7 +259,7 @@ def _motion(
     Where knocks lie together, whole segments are left out; the limits are held against the other segments. But after a
     slip the shorter part of a window looks like knocks: `stepped` is the step of the mean over all segments.
     """
-    t, _, u, du, known = points
+    t, u, du, known = points.time_s, points.u, points.du, points.struck
     V = np.asfortranarray(points.V)  # medians and extremes of an axis are several times faster this way
     if len(V) < max(limits.least_points, 2 * u.shape[1] + 2):
         sums = _sums(V, u, du, rate_hz, limits)
@@ -256,6 +285,7 @@ def _motion(
         if leave_out:
             sums = clean
     way = _along(pose, V, residual)
+    noise = points.not_noisier(detection.white_noise(points.own_u[kept])) if noise is None else noise
     numbers = motion_numbers(clean, basis[kept], V[kept] @ way, rate_hz, stepped, limits, noise)
     numbers |= nonlinearity(V @ way, residual @ way, rate_hz)
     numbers["stuck_axes"] = float(np.sum(np.ptp(V, axis=0) == 0.0))

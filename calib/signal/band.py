@@ -28,6 +28,9 @@ OF_NOISE = 0.88  # times the density of white noise: what `quietest` says of noi
 STOP_BAND_DB = 66.0
 STOP_BAND = 1.5  # times the band that the filter passes
 HALVED = 1.25  # times the band that the filter passes: where half of an amplitude is left
+# Of a slower sampling rate: what is sampled so keeps its motion up to here, and nothing is folded below.
+UNFOLDED = 0.4
+FOLDED_DB = 100.0  # a ripple of 1e-5: the sensor's samples do not pass this filter
 # At the lower end, the length of Hann's window whose mean is subtracted twice: half of an amplitude is left there.
 SLOW_CYCLES = 1.3
 
@@ -142,6 +145,27 @@ def lowpass(x: Array, rate_hz: float, band_hz: float) -> Array:
     taps = 2.0 * cut * np.sinc(2.0 * cut * n) * _kaiser(2 * half + 1)
     taps /= taps.sum()
     return convolved(x, taps)
+
+
+def unfolded(x: Array, rate_hz: float, slower_hz: float) -> Array:
+    """x (n, k) without what sampling at the rate `slower_hz` folds to frequencies up to UNFOLDED times that rate.
+
+    Its gain is 1 to 1e-5 up to there, and at most -100 dB where the folding begins. x as it is where nothing is folded
+    so far. Rows within half of the filter of an end or of a missing sample (NaN) are NaN.
+    """
+    if not folds(rate_hz, slower_hz):
+        return x
+    wide = (1.0 - 2.0 * UNFOLDED) * slower_hz / rate_hz  # from the end of the band to where the folding begins
+    half = int(np.ceil((FOLDED_DB - 8.0) / (2.285 * 2.0 * np.pi * wide) / 2.0))
+    taps = np.sinc(slower_hz / rate_hz * np.arange(-half, half + 1)) * np.kaiser(
+        2 * half + 1, 0.1102 * (FOLDED_DB - 8.7)
+    )
+    return convolved(x, taps / taps.sum())
+
+
+def folds(rate_hz: float, slower_hz: float) -> bool:
+    """Whether sampling at `slower_hz` folds frequencies of samples at `rate_hz` to UNFOLDED times the slower rate."""
+    return (1.0 - UNFOLDED) * slower_hz < 0.5 * rate_hz
 
 
 def without_slow(x: Array, rate_hz: float, from_hz: float) -> Array:

@@ -141,7 +141,7 @@ def without_integrals(bands: BandSums) -> BandSums:
     channels, m = bands.reference_channels, own_channels(bands.reference_channels)
     if channels == m:
         return bands
-    kept = np.r_[0:m, channels : channels + m, 2 * channels : 2 * channels + 3]
+    kept = np.r_[0:m, channels : channels + m, 2 * channels : bands.products.shape[1]]
     products = bands.products[:, kept[:, None], kept]
     return replace(bands, reference_channels=m, products=products, noise=bands.noise[:, kept])
 

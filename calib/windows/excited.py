@@ -163,7 +163,7 @@ def motion_of(window: Window) -> MotionSums:
     direction, noise = window.pose.direction[:, :m], np.zeros(m)
     if window.reference_noise is not None:
         noise = window.reference_noise[0] ** 2
-    power = _power(window)[:m, :m] - np.diag(noise)
+    power = _power(window, between=True)[:m, :m] - np.diag(noise)
     return MotionSums(points * direction @ power @ direction.T, points * (direction * noise) @ direction.T)
 
 
@@ -226,7 +226,7 @@ def excited(window: Window, most: int = 3) -> Excitation:
     noise = np.zeros((2, m)) if window.reference_noise is None else window.reference_noise**2
     if m == 0:
         return Excitation(window, window.pose, np.zeros((3, 0)), 0.0, np.ones(0, dtype=bool), noise)
-    both = _power(window)
+    both = _power(window, between=True)
     power = both[:m, :m]
     own = _own_power(both, noise[0], most)
     live = own > 0.0

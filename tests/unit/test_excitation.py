@@ -14,6 +14,7 @@ from calib.excitation.window_verdict import Limits, judge
 from calib.excitation.windows import Points, motion_parts, motion_windows
 from calib.geometry import along, beside, clamp
 from calib.model import Window, WindowSums
+from calib.signal.corner import with_integral
 
 RATE_HZ = 500.0
 S = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
@@ -51,6 +52,21 @@ def test_a_good_window_is_used_whole() -> None:
     assert n["reference_noise_mps2"] == pytest.approx(0.002 / np.sqrt(10), rel=0.1)
     assert n["coherence"] > 0.999
     assert n["drift_mps2"] < 0.02
+
+
+def test_slow_motion_beside_an_engine_is_one_window_whatever_its_integral_does() -> None:
+    """Waves of 9 s on a platform with an engine, beside an AC-coupled reference: its integral (calib.signal.corner)
+    shows the waves alone, which are calm twice in a period. Before, the window was cut there."""
+    t = np.arange(60 * 200) / 200.0
+    waves, engine = 2.0 * np.pi / 9.0, 2.0 * np.pi * 25.0
+    u = 0.05 * np.sin(waves * t) + 0.05 * np.sin(engine * t)
+    du = 0.05 * waves * np.cos(waves * t) + 0.05 * engine * np.cos(engine * t)
+    integral = -2.0 * np.pi * 0.05 / waves * np.cos(waves * t)
+    V = u[:, None] * S[:, 0] + 1e-3 * np.random.default_rng(1).normal(size=(len(t), 3))
+    beside_it = with_integral(along([1.0, 0.0, 0.0]))
+    window = only(motion_windows(beside_it, Points(t, V, np.column_stack([u, integral]), np.column_stack([du, u]))))
+    assert window.used, window.reason
+    assert window.numbers["reference_rms_mps2"] == pytest.approx(0.05, rel=0.1)  # 0.3 with the integral
 
 
 def knock(data: Points, at: int, size: float, length: int = 10) -> None:

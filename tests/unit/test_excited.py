@@ -143,3 +143,17 @@ def test_a_weak_channel_90_deg_ahead_is_no_motion_of_its_own_unless_the_derivati
     noise = np.array([np.full(3, NOISE_MPS2), np.full(3, 30.0 * NOISE_MPS2)])
     found = excited(Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", n, 0, reference_noise=noise))
     assert found.directions.shape == (3, channels)
+
+
+def test_motion_slower_than_a_segment_excites_too() -> None:
+    """A tower at 0.2 Hz, weakly beside its other axis: within segments of half a second the channel has hardly more
+    than its noise, between them thirty times as much. Before, its motion was left to the other channels."""
+    random, t = np.random.default_rng(1), np.arange(6000) / RATE_HZ
+    omega = 2.0 * np.pi * np.array([0.2, 0.23, 0.26])
+    size = np.array([0.03, 0.01, 0.01])
+    a, da = size * np.sin(omega * t[:, None]), size * omega * np.cos(omega * t[:, None])
+    noise = np.array([np.full(3, NOISE_MPS2), np.full(3, 30.0 * NOISE_MPS2)])
+    u, du = (x + own[0] * random.normal(size=a.shape) for x, own in zip((a, da), noise, strict=True))
+    sums = window_sums(u, du, a @ S.T, np.arange(0, len(t) + 1, 50))
+    found = excited(Window(0.0, 60.0, beside(np.eye(3)), sums, True, "", len(t), 0, reference_noise=noise))
+    assert found.live.all()

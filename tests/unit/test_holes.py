@@ -93,7 +93,7 @@ def test_the_sensitivity_scatters_as_the_real_samples_tell(lost: str) -> None:
     errors = []
     for seed in range(40):
         found = points(seed, lost)
-        t, V, u, du, _ = found.points
+        t, V, u, du, *_ = found.points
         basis = np.column_stack([np.ones(len(t)), u, du])
         solution, *_ = np.linalg.lstsq(basis, V, rcond=None)
         residual = V - basis @ solution
