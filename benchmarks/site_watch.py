@@ -270,7 +270,8 @@ def table(sensors: int, cases: int, end: float) -> str:
         if wrong:
             lines.append(f"| the same: told as a sensitivity | {wilson(count[wrong], of)} | {of} |")
         if told == "turn told":
-            lines.append(f"| of these: size within U | {wilson(count['turn covered'], count[told])} | {count[told]} |")
+            held = wilson(count["turn covered"], count[told])
+            lines.append(f"| the turns that are told: size within U | {held} | {count[told]} |")
     of = count["frequency near"]
     lines.append(f"| of these: size within U | {wilson(count['frequency covered'], of)} | {of} |")
     lines.append(f"| of these: date within what is told | {wilson(count['frequency dated'], of)} | {of} |")

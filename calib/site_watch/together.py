@@ -5,8 +5,8 @@ the same for all sensors: the level is free, so a change that all sensors share 
 changes of the sensitivity of x, y, z and turns about x, y, z; G is 1 for a sensitivity in its own amplitudes, and for
 turns follows from the co-spectra M of the sensor in the days since: a small turn changes M by W M + M W^T, with W the
 matrix of a small rotation. A turn of 1 deg is not small where one axis moves by less than a twentieth of another: its
-amplitude then changes by half. So of a sensor that has turned, M is turned by the angles that were found, and steps
-and G are those about this turn (Gauss and Newton).
+amplitude then changes by a third or more. So of a sensor that has turned, M is turned by the angles that were found,
+and steps and G are those about this turn (Gauss and Newton).
 """
 
 from __future__ import annotations
