@@ -30,7 +30,7 @@ WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk a
 COVERAGE = 2.0
 APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the norm does not fit over seasons
 # Part of the variance of a sensor that all of its gateway share: they are neighbours, and shapes move smoothly along a
-# structure. Assumed; the simulated bridge has 0.13 over 28 days (docs/site-watch.md).
+# structure. Assumed; the simulated bridge has up to 0.15, the more the nearer they stand (docs/site-watch.md).
 PART_SHARED = 0.25
 LEAST_NOISE = 0.03  # of the amplitude of the noise, for its change to be told: a sensitivity changes the noise alike
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
