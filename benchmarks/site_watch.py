@@ -55,6 +55,7 @@ LEARNED_DAYS = 240
 CASES_OF_A_SITE = {8: 8, 30: 20, 200: 40}
 PAIRS_PART = 3 / 8  # cases of two sensors for each case of one: 60 for 160
 DAMAGE_DAYS = 4, 7, 10, 14
+TURN_RAD = np.radians(1.0)
 SITE_DAYS = 730
 FIRST_LOOK = 45  # days after the begin of a site
 WORLDS = {
@@ -131,10 +132,12 @@ def others(bridge: Bridge, watch: SiteWatch, cases: int, count: Counter[str]) ->
         count["gateway cases"] += 1
         count["gateway told"] += list(found.gateways) == [g]
         count["gateway others"] += any(x >= 0 and bridge.gateway[x] != g for x in named(found))
-        (found,) = told_after(watch, (turned(hours, i, axis, np.radians(1.0)) for hours in future), (14,))
+        (found,) = told_after(watch, (turned(hours, i, axis, TURN_RAD) for hours in future), (14,))
         count["turn cases"] += 1
         count["turn told"] += found.sensors[i].kind == "turn"
         count["turn as sensitivity"] += found.sensors[i].kind == "sensitivity"
+        if found.sensors[i].kind == "turn":
+            count["turn covered"] += bool(abs(found.sensors[i].size - TURN_RAD) <= found.sensors[i].U)
         (found,) = told_after(watch, (noisier(hours, i, bridge, random) for hours in future), (14,))
         count["noise cases"] += 1
         count["noise told"] += found.sensors[i].kind == "noise"
@@ -266,6 +269,9 @@ def table(sensors: int, cases: int, end: float) -> str:
         lines.append(f"| {name} | {wilson(count[told], of)} | {of} |")
         if wrong:
             lines.append(f"| the same: told as a sensitivity | {wilson(count[wrong], of)} | {of} |")
+        if told == "turn told":
+            held = wilson(count["turn covered"], count[told])
+            lines.append(f"| the turns that are told: size within U | {held} | {count[told]} |")
     of = count["frequency near"]
     lines.append(f"| of these: size within U | {wilson(count['frequency covered'], of)} | {of} |")
     lines.append(f"| of these: date within what is told | {wilson(count['frequency dated'], of)} | {of} |")

@@ -4,9 +4,10 @@
 
 Of U_BAND: how many changes of 0.5 % would be found after 30 days without it, with half and twice of it, and the mean
 square of the steps of sound sensors over their u, as a check of this u. Of PRIOR_TESTS: the mean factor on u, where all
-tests of a site have once, twice and four times the variance that is expected. Of PART_SHARED: how far the scores of
-sensors correlate, of one gateway and of two, in blocks of days (sensors without anything in common have -1/7 at a site
-of 8, since the level is theirs); and how often a gateway that has changed for 14 days is told as this gateway.
+tests of a site have once, twice and four times the variance that is expected. Of PART_SHARED: how often a gateway that
+has changed for 14 days is told as this gateway; and how far the scores of sensors correlate, of one gateway and of two,
+in blocks of days, over two years of the sound sites of benchmarks.site_watch (sensors without anything in common have
+-1/(n - 1), since the level is theirs).
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import copy
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from benchmarks.beam_world import BANDS_HZ, Bridge
 from benchmarks.page import write_part
-from benchmarks.site_watch import GATEWAYS, LEARNED_DAYS
+from benchmarks.site_watch import GATEWAYS, LEARNED_DAYS, SITE_DAYS
 from calib.distributions import NORMAL
 from calib.model import Array
 from calib.site_watch import together, verdicts, watch
@@ -35,6 +37,7 @@ from calib.site_watch.watch import SiteWatch
 SENSORS, LATE_DAYS, FIRST_DAY, DRAWS = 8, 14, 30, 300
 PRIORS, SHARED, SIZES = (30.0, 60.0, 120.0), (0.125, 0.25, 0.5), (-0.01, 0.005)
 BLOCKS = 1, 7, 28
+ALIKE_SITES = {8: 6, 30: 5, 200: 2}  # of so many sensors
 BANDED, MONTH_DAYS, SMALL = (0.0, 0.00375, 0.0075, 0.015), 30, 0.005
 
 Site = tuple[Bridge, list[Day]]
@@ -109,14 +112,12 @@ def _stepped(bridge: Bridge, days: list[Day]) -> tuple[Array, Array]:
 
 
 def shared(sites: list[Site]) -> list[str]:
-    """Correlations of scores, and gateways that are told, for each part that is taken as common."""
+    """Gateways that are told, for each part that is taken as common."""
     told: Counter[tuple[float, float]] = Counter()
-    correlation: dict[int, list[tuple[float, float]]] = {days: [] for days in BLOCKS}
     for bridge, days in sites:
-        site = Heard(bridge.gateway, BANDS_HZ)
+        site = SiteWatch(bridge.gateway, BANDS_HZ)
         for day in days[:-LATE_DAYS]:
             site.update(day)
-        _correlated(np.array(site.scores)[FIRST_DAY:], bridge.gateway, correlation)
         for gateway in range(bridge.gateways):
             for size in SIZES:
                 changed = SiteWatch.loaded(copy.deepcopy(site.snapshot()))
@@ -129,10 +130,35 @@ def shared(sites: list[Site]) -> list[str]:
     lines = ["| part that is common | " + " | ".join(f"{100 * s:+g} %: told as this gateway" for s in SIZES) + " |"]
     lines.append("| --- | " + " | ".join("---" for _ in SIZES) + " |")
     lines += [f"| {part:g} | {' | '.join(f'{told[part, size]} of {cases}' for size in SIZES)} |" for part in SHARED]
-    lines += ["", "| blocks of | correlation within a gateway | between gateways |", "| --- | --- | --- |"]
-    for number, pairs in correlation.items():
-        mean, u = np.mean(pairs, axis=0), np.std(pairs, axis=0) / np.sqrt(len(sites))
-        lines.append(f"| {number} d | {mean[0]:.2f} ± {2.0 * u[0]:.2f} | {mean[1]:.2f} ± {2.0 * u[1]:.2f} |")
+    return lines
+
+
+def sound_days(seed: int, sensors: int) -> tuple[Array, Iterable[Day]]:
+    """The gateways and the days of a sound site."""
+    bridge = Bridge(seed, sensors, GATEWAYS[sensors])
+    bridge.hour = 24 * (61 * seed % 365)
+    return bridge.gateway, (day_of(hours, BANDS_HZ) for hours in bridge.days(SITE_DAYS))
+
+
+def alike() -> list[str]:
+    """How much more the scores of sensors of one gateway correlate than those of two."""
+    lines = [
+        "| sensors | sites | blocks of | correlation within a gateway | between gateways | difference |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for sensors, sites in ALIKE_SITES.items():
+        correlation: dict[int, list[tuple[float, float]]] = {days: [] for days in BLOCKS}
+        for seed in range(2000, 2000 + sites):
+            gateway, days = sound_days(seed, sensors)
+            site = Heard(gateway, BANDS_HZ)
+            for day in days:
+                site.update(day)
+            _correlated(np.array(site.scores)[FIRST_DAY:], gateway, correlation)
+        for number, pairs in correlation.items():
+            more = np.subtract(*np.transpose(pairs))
+            cells = " | ".join(f"{mean:.2f}" for mean in np.mean(pairs, axis=0))
+            u = np.std(more, ddof=1) / np.sqrt(sites)
+            lines.append(f"| {sensors} | {sites} | {number} d | {cells} | {more.mean():.2f} ± {2.0 * u:.2f} |")
     return lines
 
 
@@ -165,6 +191,8 @@ if __name__ == "__main__":
         *factors(),
         "",
         *shared(sites),
+        "",
+        *alike(),
     ]
     if given.write:
         write_part("site-watch assumed", "\n".join(lines))

@@ -51,12 +51,12 @@ def uncertainties(watch: SiteWatch, days: int) -> Iterator[Array]:
     dependent = watch.days_scatter.over(watch.day, [begin])
     before = min(begin - steps.begins[0], verdicts.LONGEST_DAYS)
     walk = verdicts.WALK_PER_ROOT_DAY * np.sqrt(np.array([(watch.day - begin + 1 + before) / 3.0]))
-    one, none = np.ones_like(dependent), np.zeros(1)
+    one, none, norm = np.ones_like(dependent), np.zeros(1), watch.norm_since([k], size[None])
     for info, inflation, walked in (
         (known, one, none), (learned_days / of_day, one, none), (own, one, none), (own, dependent, none),
         (own, dependent, walk),
     ):  # fmt: skip
-        yield jointly(np.zeros((1, *watch.shape)), info[None], watch.G, inflation, walked).u[0]
+        yield jointly(np.zeros((1, *watch.shape)), info[None], *norm, inflation, walked).u[0]
 
 
 def table(sites: int) -> str:

@@ -80,6 +80,15 @@ class Steps:
         size = np.where(few, 0.0, c - np.sum(u * self.b, axis=1)) / np.where(few, 1.0, information)
         return size, np.where(few, 0.0, information), since[:, TERMS + 1]
 
+    def norm_since(self, which: list[int], size: Array) -> tuple[Array, Array]:
+        """Of the days since `begins[k]`, k in `which`: their mean regressors (k, TERMS, C), and what the norm without a
+        step of `size` (k, C) expects of them (k, C); 0 and NaN where no day counts."""
+        v = self.A[0] - np.array([self.before[k][:TERMS] for k in which])
+        there = v[:, 0] > 0.0
+        x = np.where(there[:, None], v, 0.0) / np.where(there, v[:, 0], 1.0)[:, None]
+        moved = np.einsum("pqc,kqc,kc->kpc", self.inverse, v, size, optimize=True)
+        return x, np.where(there, np.sum(x * (self.beta - moved), axis=1), np.nan)
+
     def rest(self) -> tuple[Array, Array]:
         """Weighted sum of squares that the norm leaves, and its degrees of freedom."""
         left = self.squares - np.einsum("pc,pc->c", self.beta, self.b)

@@ -2,9 +2,11 @@
 
 A step of a channel of sensor i in band b is  lambda_b + G_ib theta_i + what belongs to this band alone.  lambda is
 the same for all sensors: the level is free, so a change that all sensors share is not seen. theta are relative
-changes of the sensitivity of x, y, z and small turns about x, y, z; G is 1 for a sensitivity in its own amplitudes,
-and for turns follows from the co-spectra M of the sensor: a turn changes M by W M + M W^T, with W the matrix of a
-small rotation.
+changes of the sensitivity of x, y, z and turns about x, y, z; G is 1 for a sensitivity in its own amplitudes, and for
+turns follows from the co-spectra M of the sensor in the days since: a small turn changes M by W M + M W^T, with W the
+matrix of a small rotation. A turn of 1 deg is not small where one axis moves by less than a twentieth of another: its
+amplitude then changes by a third or more. So of a sensor that has turned, M is turned by the angles that were found,
+and steps and G are those about this turn (Gauss and Newton).
 """
 
 from __future__ import annotations
@@ -23,6 +25,11 @@ DIRECTIONS = np.array(
      [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]], dtype=float,
 )  # fmt: skip
 SENSITIVITIES, ALL, TURNS = slice(0, 4), 3, slice(4, 7)
+# W of turns about x, y, z: one about x adds a_z to y and takes a_y from z.
+W = np.array(
+    [[[0, 0, 0], [0, 0, 1], [0, -1, 0]], [[0, 0, -1], [0, 0, 0], [1, 0, 0]], [[0, 1, 0], [-1, 0, 0], [0, 0, 0]]],
+    dtype=float,
+)  # fmt: skip
 MEDIAN_SQUARE = 0.4549  # the median m of the square of a standard normal deviate
 # Tests that are worth what all of a site say at one begin of the scatter of its steps. The median of N squares has the
 # relative variance 5.44 / N, which is 1 / (N (2 m f)²) with their density f = 0.471 at m. So this prior is the best
@@ -31,26 +38,32 @@ PRIOR_TESTS = 60.0
 REJECT = 6.0  # standard uncertainties from which a sensor or channel does not say what is common (Tukey's biweight)
 ROUNDS = 4
 FEWEST_TO_NAME = 3  # sensors with a band, for it to say which one has changed
-LARGEST_RATIO = 10.0  # of the amplitudes of two axes, for the cross power to tell of a turn
+LARGEST_RATIO = 10.0  # of the amplitudes of two axes, for the cross power to tell that there is a turn
+FAR = 4.0  # standard uncertainties from which a turn is not small
+PRIOR_TURN = (
+    0.1  # rad, standard uncertainty of a turn before any data: about an axis of which bands say nothing it is 0
+)
 
 
-def design(value: Array, level: Array) -> Array:
-    """G (n, B, 6, 6) from the mean of the channels (n, B, 6) and levels (B, 3); 0 where a channel is not known."""
+def design(value: Array, level: Array, largest_ratio: float = LARGEST_RATIO) -> Array:
+    """G (..., B, 6, 6) from the channels (..., B, 6) and the level (..., B, 3); 0 where a channel is not known.
+
+    Amplitudes of two axes count as if one were at most `largest_ratio` times the other.
+    """
     amplitude = value[..., :3] + level
-    ratio = np.clip(amplitude[..., :, None] - amplitude[..., None, :], -np.log(LARGEST_RATIO), np.log(LARGEST_RATIO))
+    most = np.log(largest_ratio)
+    ratio = np.clip(amplitude[..., :, None] - amplitude[..., None, :], -most, most)
     cross = np.clip(np.nan_to_num(value[..., 3:]), -1.0, 1.0)
-    rho = np.zeros((*value.shape[:2], 3, 3))
+    rho = np.zeros((*value.shape[:-1], 3, 3))
     rho[..., [0, 1, 2], [0, 1, 2]] = 1.0
     for c, (j, k) in enumerate(zip(*PAIRS, strict=True)):
         rho[..., j, k] = rho[..., k, j] = cross[..., c]
     # N_jl = M_lk / (a_j a_k): what a part of axis l in output j makes of the normalised co-spectrum j, k
-    G = np.zeros((*value.shape[:2], 6, 6))
+    G = np.zeros((*value.shape[:-1], 6, 6))
     G[..., [0, 1, 2], [0, 1, 2]] = 1.0
     share = np.exp(np.nan_to_num(-ratio))  # (.., j, l): amplitude of l over that of j
     for w in range(3):
-        W = np.zeros((3, 3))
-        W[(w + 1) % 3, (w + 2) % 3], W[(w + 2) % 3, (w + 1) % 3] = 1.0, -1.0
-        mixed = np.einsum("jl,nbjl,nblk->nbjk", W, share, rho)  # (W M)_jk / (a_j a_k)
+        mixed = (W[w] * share) @ rho  # (W M)_jk / (a_j a_k)
         G[..., :3, 3 + w] = amplitudes = mixed[..., [0, 1, 2], [0, 1, 2]]
         for c, (j, k) in enumerate(zip(*PAIRS, strict=True)):
             G[..., 3 + c, 3 + w] = (
@@ -59,19 +72,46 @@ def design(value: Array, level: Array) -> Array:
     return np.where(np.isfinite(value)[..., None], G, 0.0)
 
 
+def turned(value: Array, level: Array, turn: Array) -> Array:
+    """The channels (r, B, 6) of sensors that have turned by `turn` (r, 3), from those before it and the level
+    (r, B, 3). No amplitude falls below one over LARGEST_RATIO of what it was."""
+    amplitude = value[..., :3] + level
+    known = np.isfinite(amplitude)
+    top = np.max(np.where(known, amplitude, -np.inf), axis=-1, keepdims=True, initial=-700.0)
+    a = np.where(known, np.exp(np.where(known, amplitude - top, 0.0)), 0.0)
+    cross = np.clip(np.nan_to_num(value[..., 3:]), -1.0, 1.0)
+    M = np.zeros((*a.shape, 3))
+    M[..., [0, 1, 2], [0, 1, 2]] = np.square(a)
+    M[..., PAIRS[0], PAIRS[1]] = M[..., PAIRS[1], PAIRS[0]] = cross * a[..., PAIRS[0]] * a[..., PAIRS[1]]
+    R = _rotation(turn)[:, None]
+    M = R @ M @ np.swapaxes(R, -1, -2)
+    b = np.sqrt(np.maximum(M[..., [0, 1, 2], [0, 1, 2]], np.square(a / LARGEST_RATIO)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        after = np.log(b) + top - level, M[..., PAIRS[0], PAIRS[1]] / (b[..., PAIRS[0]] * b[..., PAIRS[1]])
+    return np.where(np.isfinite(value), np.concatenate(after, axis=-1), np.nan)
+
+
+def _rotation(turn: Array) -> Array:
+    """Matrices (r, 3, 3) that turn a sensor by the angles `turn` (r, 3), whose vector is the axis (Rodrigues)."""
+    angle = np.sqrt(np.square(turn).sum(axis=-1))[:, None, None]
+    own = np.einsum("rw,wjk->rjk", turn, W)
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * own + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * (own @ own))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JointChange:
     """For each begin (k): `size`, `u` (k, n, 7): the change in each of DIRECTIONS by itself. `rest` (k, n, B, 6):
-    steps without what is common; `information` (k, n, B, 6): of these, over the variance. `statistic` (k, n, 7): the
-    change over its u; of a turn the smaller one of this and the same without the band that says most, since the weak
-    axis of one band says much of a turn, and moves by itself when the loads of two modes change. `scatter` (k, 1, 7):
-    factor of u by what all sensors of the site differ by. `pair` (k,): no more than two
-    sensors can be compared, so that both show a change of either."""
+    steps without what is common; `information` (k, n, B, 6): of these, over the variance; `G` (k, n, B, 6, 6): what a
+    change of one unit makes of them. `statistic` (k, n, 7): the change over its u; of a turn the smaller one of this
+    and the same without the band that says most, since the weak axis of one band says much of a turn, and moves by
+    itself when the loads of two modes change. `scatter` (k, 1, 7): factor of u by what all sensors of the site differ
+    by. `pair` (k,): no more than two sensors can be compared, so that both show a change of either."""
 
     size: Array
     u: Array
     rest: Array
     information: Array
+    G: Array
     statistic: Array
     scatter: Array
     pair: NDArray[np.bool_]
@@ -82,11 +122,12 @@ class JointChange:
         return self.statistic * self.scatter
 
 
-def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: Array) -> JointChange:
+def jointly(step: Array, information: Array, value: Array, level: Array, inflation: Array, walk: Array) -> JointChange:
     """All sensors at once, robustly: what a few sensors do differently does not move what is common.
 
-    `step`, `information` (k, n, B, 6); `inflation` (k, n, 7): variance of each direction over what independent
-    channels have; `walk` (k,): standard uncertainty by which a sensitivity may have changed by itself.
+    `step`, `information` (k, n, B, 6); `value` (k, n, B, 6), `level` (k, n, B, 3): the channels and the level that the
+    norm expects of the days since, without the step; `inflation` (k, n, 7): variance of each direction over what
+    independent channels have; `walk` (k,): standard uncertainty by which a sensitivity may have changed by itself.
     """
     pair, information = _named_only(information)
     inflation = np.where(pair[:, None, None], inflation.max(axis=1, keepdims=True), inflation)
@@ -96,8 +137,12 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
     rest[..., :3] = np.where(others > 0.0, step[..., :3] - common, 0.0)
     both = information[..., :3] + others
     alone[..., :3] = information[..., :3] * others / np.where(both > 0.0, both, 1.0)
-    score, squares = scores(rest, alone, G)
-    size, u = _sized(score, squares, inflation, walk)
+    G = design(value, level)
+    size, u = _sized(*scores(rest, alone, G), inflation, walk)
+    far = (np.abs(size[..., TURNS]) > FAR * u[..., TURNS]).any(axis=-1)
+    far &= np.sum(alone > 0.0, axis=(-2, -1)) > G.shape[-1]  # more channels than unknowns
+    rest[far], G[far] = _about_turns(rest[far], alone[far], value[far], level[far])
+    size, u = _sized(*scores(rest, alone, G), inflation, walk)
     # Of two the level is the mean, so each shows half of what they differ by, and half of its scatter.
     u[pair, :, SENSITIVITIES] *= np.sqrt(2.0)
     scatter = np.where(pair[:, None, None], 1.0, _scatter_of_all(size / u))
@@ -109,7 +154,30 @@ def jointly(step: Array, information: Array, G: Array, inflation: Array, walk: A
         np.abs(statistic[..., TURNS]), np.sign(size[..., TURNS]) * size_apart / u_apart / scatter[..., TURNS]
     )
     statistic[..., TURNS] = np.sign(size[..., TURNS]) * np.maximum(least, 0.0)
-    return JointChange(size, u, rest, alone, statistic, scatter, pair)
+    return JointChange(size, u, rest, alone, G, statistic, scatter, pair)
+
+
+def _about_turns(step: Array, information: Array, value: Array, level: Array) -> tuple[Array, Array]:
+    """Steps (r, B, 6) and G (r, B, 6, 6) of sensors that have turned, about the turn that explains the steps best."""
+    about, turn = step, np.zeros((len(step), 3))
+    for _ in range(ROUNDS):
+        after = turned(value, level, turn)
+        G = design(after, level, np.inf)
+        about = step - np.nan_to_num(after - value) + (G[..., 3:] @ turn[:, None, :, None])[..., 0]
+        turn = fitted(about, information, G)[:, 3:]
+    return about, G
+
+
+def fitted(step: Array, information: Array, G: Array) -> Array:
+    """theta (..., 6) that explains the steps (..., B, 6) of each sensor best, with the prior of turns."""
+    flat = (*step.shape[:-2], step.shape[-2] * step.shape[-1])
+    r, info, g = step.reshape(flat), information.reshape(flat), G.reshape(*flat, G.shape[-1])
+    normal = np.swapaxes(g, -1, -2) @ (info[..., None] * g)
+    trace = np.trace(normal, axis1=-2, axis2=-1)
+    normal += (1e-9 * trace + 1e-12)[..., None, None] * np.eye(g.shape[-1])
+    normal[..., [3, 4, 5], [3, 4, 5]] += PRIOR_TURN**-2
+    right = ((info * r)[..., None, :] @ g)[..., 0, :]
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 
 
 def _named_only(information: Array) -> tuple[NDArray[np.bool_], Array]:
@@ -149,9 +217,9 @@ def _scatter_of_all(statistic: Array) -> Array:
 
 
 def _without_loudest(rest: Array, information: Array, G: Array) -> tuple[Array, Array]:
-    """As `scores` of turns (k, n, 3), without the band that says most of each; `G` (n, B, 6, 3)."""
-    push = np.einsum("knbc,nbct->knbt", information * rest, G, optimize=True)
-    squares = np.einsum("knbc,nbct->knbt", information, np.square(G), optimize=True)
+    """As `scores` of turns (k, n, 3), without the band that says most of each; `G` (k, n, B, 6, 3)."""
+    push = ((information * rest)[..., None, :] @ G)[..., 0, :]
+    squares = (information[..., None, :] @ np.square(G))[..., 0, :]
     total = push.sum(axis=2, keepdims=True)
     loudest = np.argmax(push * np.sign(total), axis=2)[:, :, None]
     left = [each.sum(axis=2) - np.take_along_axis(each, loudest, axis=2)[:, :, 0] for each in (push, squares)]
@@ -160,9 +228,9 @@ def _without_loudest(rest: Array, information: Array, G: Array) -> tuple[Array, 
 
 def scores(values: Array, information: Array, G: Array) -> tuple[Array, Array]:
     """Sum of g I r and of g I g over the channels of each sensor, for each direction: (..., n, 7) each."""
-    n, channels = len(G), G.shape[1] * G.shape[2]
-    g = (G @ DIRECTIONS.T).reshape(n, channels, len(DIRECTIONS))
-    flat = (*information.shape[:-3], n, 1, channels)
+    channels = information.shape[-2] * information.shape[-1]
+    g = (G @ DIRECTIONS.T).reshape(*G.shape[:-3], channels, len(DIRECTIONS))
+    flat = (*information.shape[:-2], 1, channels)
     weighted = information.reshape(flat)
     return (weighted * values.reshape(flat) @ g)[..., 0, :], (weighted @ np.square(g))[..., 0, :]
 

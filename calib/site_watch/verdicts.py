@@ -18,7 +18,7 @@ from calib.site_watch import frequencies
 from calib.site_watch.frequencies import FrequencyChange
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR_DEGREES, TERMS, Steps
-from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, jointly, median
+from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, fitted, jointly, median
 from calib.site_watch.watch import VISIT, SiteWatch, pooled
 from calib.site_watch.witnesses import Witness, gravity, noise, self_test
 
@@ -30,10 +30,12 @@ WALK_PER_ROOT_DAY = 3e-5  # standard uncertainty of the sensitivity's own walk a
 COVERAGE = 2.0
 APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the norm does not fit over seasons
 # Part of the variance of a sensor that all of its gateway share: they are neighbours, and shapes move smoothly along a
-# structure. Assumed; the simulated bridge has 0.13 over 28 days (docs/site-watch.md).
+# structure. Assumed; the simulated bridge has up to 0.15, the more the nearer they stand (docs/site-watch.md).
 PART_SHARED = 0.25
 LEAST_NOISE = 0.03  # of the amplitude of the noise, for its change to be told: a sensitivity changes the noise alike
 ALIKE = 0.1  # of a change: how far its bands may differ by themselves
+# Of an angle, relative: days tell means of cross powers and of log amplitudes, and a turn acts in each hour by itself.
+U_TURN = 0.1
 FEWEST_BANDS = 3  # for bands to be called alike
 NAMES = ("sensitivity of x", "sensitivity of y", "sensitivity of z", "sensitivity of x, y and z",
          "turn about x", "turn about y", "turn about z")  # fmt: skip
@@ -243,8 +245,8 @@ def examined(watch: SiteWatch, without: NDArray[np.bool_] | None = None) -> Test
     before = np.minimum([begins[k] - begins[0] for k in which], LONGEST_DAYS)
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
     inflation = watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
-    joint = jointly(size, information, watch.G, inflation, walk)
-    apart = _apart(joint, watch.G)
+    joint = jointly(size, information, *watch.norm_since(which, size), inflation, walk)
+    apart = _apart(joint)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
     return Tests([begins[k] for k in which], joint, apart, bands)
 
@@ -255,22 +257,16 @@ def _without(variance: Array, size: Array, information: Array, days: Array) -> A
     return np.asarray(np.maximum(variance - size**2 * information / freedom, LEAST_VARIANCE * variance))
 
 
-def _apart(joint: JointChange, G: Array) -> Array:
+def _apart(joint: JointChange) -> Array:
     """How much the bands of each sensor differ from any change of its sensitivities and any turn, (k, n).
 
     What most sensors show, such as days that the norm does not fit, is taken as scatter.
     """
-    n, channels = len(G), G.shape[1] * G.shape[2]
-    g = G.reshape(n, channels, -1)
-    r, info = joint.rest.reshape(-1, n, channels), joint.information.reshape(-1, n, channels)
-    normal = np.swapaxes(g, 1, 2) @ (info[..., None] * g)
-    trace = np.trace(normal, axis1=-2, axis2=-1)
-    normal += (1e-9 * trace + 1e-12)[..., None, None] * np.eye(g.shape[-1])
-    right = ((info * r)[..., None, :] @ g)[..., 0, :]
-    fitted = (g @ np.linalg.solve(normal, right[..., None]))[..., 0]
-    own = info / (1.0 + info * np.square(ALIKE * fitted))
-    squares = np.sum(own * np.square(r - fitted), axis=-1)
-    freedom = np.sum(info > 0.0, axis=-1) - g.shape[-1]
+    info, theta = joint.information, fitted(joint.rest, joint.information, joint.G)
+    explained = (joint.G @ theta[:, :, None, :, None])[..., 0]
+    own = info / (1.0 + info * np.square(ALIKE * explained))
+    squares = np.sum(own * np.square(joint.rest - explained), axis=(-2, -1))
+    freedom = np.sum(info > 0.0, axis=(-2, -1)) - theta.shape[-1]
     f = np.maximum(freedom, 1).astype(float)
     site = np.where(joint.pair, 1.0, median(np.where(freedom > 0, squares / f, np.nan), axis=1))
     ratio = squares / f / (APART_MISFIT * np.maximum(site, 1.0))[:, None]
@@ -295,8 +291,9 @@ def _sensor(tests: Tests, i: int, limit: float, noise: SensorVerdict) -> SensorV
         if tests.joint.pair[best] and kind == "sensitivity":
             kind, what = "one of two", f"{what}, or that of the other sensor against it; which one is not seen"
         kind = kind if tests.bands[best, i] >= FEWEST_BANDS else "sensor or structure"
-        size, u = tests.joint.size[best, i, direction], tests.joint.u[best, i, direction]
-        return SensorVerdict(kind, what, float(size), COVERAGE * float(u), *dates, z, direction)
+        size, u = float(tests.joint.size[best, i, direction]), float(tests.joint.u[best, i, direction])
+        u = float(np.hypot(u, U_TURN * size)) if direction > ALL else u
+        return SensorVerdict(kind, what, size, COVERAGE * u, *dates, z, direction)
     return noise
 
 

@@ -64,7 +64,6 @@ class SiteWatch:
         self.seen_degc = np.tile([np.inf, -np.inf], (self.shape[0], 1))
         self.degc = np.nan  # of the last day
         self.lag_h = np.zeros(self.shape[0])  # of each clock, on the last day that tells it
-        self.G = np.zeros((*self.shape, CHANNELS))
 
     def update(self, day: Day, visits: Visits | None = None) -> None:
         """Take a day. `visits`: sensors whose calibration changed in it; their norm begins anew after it.
@@ -94,7 +93,8 @@ class SiteWatch:
         residual[..., :3] -= common
         value[..., :3] -= common
         z = residual * np.sqrt(information)
-        self._scatter(z, information)
+        G = design(np.where(left > -TERMS, expected.reshape(self.shape), np.nan), np.nan_to_num(day.level))
+        self._scatter(z, information, G)
         weight *= np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9))
         self.steps.update(day.number, x, value.ravel(), weight.ravel())
         self.days_scatter.remember(self.steps.begins)
@@ -107,8 +107,13 @@ class SiteWatch:
         self._take_self_tests(day, visited)
         self._take_frequencies(day, x)
         self._seen(there.sum(axis=(1, 2)) > 0)
-        mean = self.steps.beta[0].reshape(self.shape)
-        self.G = design(np.where(self.steps.days.reshape(self.shape) > 0, mean, np.nan), np.nan_to_num(self.origin))
+
+    def norm_since(self, which: list[int], size: Array) -> tuple[Array, Array]:
+        """What the norm without steps of `size` (k, n, B, 6) expects of the days since begins `which`: the channels
+        (k, n, B, 6), NaN where no day counts, and the log amplitude of the level (k, n, B, 3)."""
+        x, value = self.steps.norm_since(which, size.reshape(len(which), -1))
+        away = (x[:, 3] + x[:, 4]).reshape(size.shape)[..., :3]
+        return value.reshape(size.shape), np.nan_to_num(self.origin) + away
 
     def variance(self) -> Array:
         """Variance of the channels (n, B, 6) over what their noise gives, with dependence over a week.
@@ -139,7 +144,7 @@ class SiteWatch:
         """The watch of a snapshot."""
         watch = cls(told["gateway"], told["band_hz"])
         watch.day, watch.degc = int(told["day"]), float(told["degc"])
-        for name in ("origin", "seen_degc", "G", "visits", "u_supply", "lag_h"):
+        for name in ("origin", "seen_degc", "visits", "u_supply", "lag_h"):
             setattr(watch, name, told[name].copy())
         for name in _PARTS:
             getattr(watch, name).load(told[name])
@@ -168,12 +173,12 @@ class SiteWatch:
         x[3] = np.column_stack([away - whole, away[:, [0, 0, 1]] - away[:, [1, 2, 2]]])
         return np.repeat(x[:, None], self.shape[0], axis=1).reshape(TERMS, -1)
 
-    def _scatter(self, z: Array, information: Array) -> None:
+    def _scatter(self, z: Array, information: Array, G: Array) -> None:
         """What this day says of the scatter: by channel, and by direction of each sensor."""
         there = information > 0.0
         self.band_scatter.update(z, there)
         clipped = np.where(there, np.clip(z, -HUBER, HUBER), 0.0) / np.sqrt(np.where(there, information, 1.0))
-        score, squares = scores(clipped, information, self.G)
+        score, squares = scores(clipped, information, G)
         known = squares > 0.0
         self.days_scatter.update(score / np.sqrt(np.where(known, squares, 1.0)), known)
 
@@ -240,7 +245,7 @@ class SiteWatch:
             self.seen_degc[told, 1] = np.maximum(self.seen_degc[told, 1], self.degc)
 
 
-_OWN = ("origin", "seen_degc", "degc", "G", "visits", "u_supply", "lag_h")
+_OWN = ("origin", "seen_degc", "degc", "visits", "u_supply", "lag_h")
 _PARTS = (
     *("steps", "noise", "means", "self_tests", "frequencies"),
     *("days_scatter", "band_scatter", "noise_scatter", "mean_scatter", "self_test_scatter", "frequency_scatter"),

@@ -8,13 +8,14 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib.model import Array
 from calib.site_watch.day import Day, Hours, SelfTests, Visits, day_of
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR, TERMS, Steps, inverted
-from calib.site_watch.together import ALL, DIRECTIONS, design, jointly
-from calib.site_watch.verdicts import SiteVerdicts, examined, limit_of, result
+from calib.site_watch.together import ALL, DIRECTIONS, design, jointly, turned
+from calib.site_watch.verdicts import SiteVerdicts, _apart, examined, limit_of, result
 from calib.site_watch.visits import teach
 from calib.site_watch.watch import PRIOR_VISITS, VISIT, SiteWatch
 
@@ -110,10 +111,9 @@ def test_all_sensors_jointly_are_generalised_least_squares_with_free_levels() ->
     random, n, bands = np.random.default_rng(4), 6, 4
     step, info = random.normal(0, 0.02, (n, bands, 6)), random.uniform(1e4, 4e4, (n, bands, 6))
     info[..., 3:] = 0.0
-    G = np.zeros((n, bands, 6, 6))
-    G[..., [0, 1, 2], [0, 1, 2]] = 1.0
+    norm = np.zeros((1, n, bands, 6)), np.zeros((1, n, bands, 3))
     # Inflated so much that no sensor loses weight: the robust estimate is then least squares.
-    joint = jointly(step[None], info[None], G, np.full((1, n, 7), 1e8), np.zeros(1))
+    joint = jointly(step[None], info[None], *norm, np.full((1, n, 7), 1e8), np.zeros(1))
     for i, axis in ((0, 0), (4, 2)):
         A = np.zeros((n * bands, bands + 1))
         for j in range(n):
@@ -127,15 +127,16 @@ def test_all_sensors_jointly_are_generalised_least_squares_with_free_levels() ->
         assert joint.u[0, i, axis] == pytest.approx(u, rel=1e-4)
 
 
+def channels(M: Array) -> Array:
+    """The channels of co-spectra M (3, 3)."""
+    a = 0.5 * np.log(np.diag(M))
+    return np.array([*a, *(M[j, k] / np.exp(a[j] + a[k]) for j, k in ((0, 1), (0, 2), (1, 2)))])
+
+
 def test_the_design_of_a_turn_is_the_difference_of_turned_spectra() -> None:
     random, angle = np.random.default_rng(5), 1e-5
     root = random.normal(size=(3, 3))
     M = root @ root.T
-
-    def channels(M: Array) -> Array:
-        a = 0.5 * np.log(np.diag(M))
-        return np.array([*a, *(M[j, k] / np.exp(a[j] + a[k]) for j, k in ((0, 1), (0, 2), (1, 2)))])
-
     G = design(channels(M)[None, None], np.zeros((1, 3)))[0, 0]
     for axis in range(3):
         j, k = (axis + 1) % 3, (axis + 2) % 3
@@ -143,6 +144,57 @@ def test_the_design_of_a_turn_is_the_difference_of_turned_spectra() -> None:
         R[j, k], R[k, j] = angle, -angle
         assert np.allclose((channels(R @ M @ R.T) - channels(M)) / angle, G[:, 3 + axis], rtol=1e-3, atol=1e-3)
     assert np.array_equal(G[:, :3], np.eye(6)[:, :3])
+
+
+def test_turned_channels_are_those_of_turned_spectra() -> None:
+    """By 20 deg about an axis askew; and an output that tells nothing stays so."""
+    root, turn = np.random.default_rng(5).normal(size=(3, 3)), np.radians(20.0) * np.array([0.6, 0.0, 0.8])
+    M, R = root @ root.T, Rotation.from_rotvec(-turn).as_matrix()  # the axes turn, not the motion
+    level = np.array([0.3, -0.2, 0.9])
+    value = channels(M) - np.append(level, np.zeros(3))
+    after = turned(value[None, None], level[None, None], turn[None])[0, 0]
+    assert np.allclose(after + np.append(level, np.zeros(3)), channels(R @ M @ R.T), atol=1e-12)
+    value[[0, 3, 4]] = np.nan
+    after = turned(value[None, None], level[None, None], turn[None])[0, 0]
+    assert np.isnan(after[[0, 3, 4]]).all()
+    assert np.isfinite(after[[1, 2, 5]]).all()
+
+
+@pytest.mark.parametrize("degrees", [0.3, 1.0, 3.0])
+def test_a_turn_of_a_sensor_with_a_weak_axis_explains_all_of_its_bands(degrees: float) -> None:
+    """x of sensor 7 moves by a 12th to a 25th of z: a turn of 1 deg changes it by a fifth to a half."""
+    random = np.random.default_rng(21)
+    step, information, value, level = steps_of(np.zeros((9, 6, 3)))
+    angle = np.radians(degrees)
+    R = Rotation.from_rotvec([0.0, -angle, 0.0]).as_matrix()
+    information[:] = 1.0 / 0.003**2
+    for b in range(6):
+        root = random.normal(size=(3, 5))
+        root[0] *= random.uniform(0.04, 0.08)
+        M = root @ root.T
+        value[0, 7, b] = channels(M)
+        step[0, 7, b] = channels(R @ M @ R.T) - channels(M)
+    joint = jointly(step, information, value, level, np.ones((1, 9, 7)), np.zeros(1))
+    assert np.argmax(np.abs(joint.statistic[0, 7])) == 5
+    assert joint.size[0, 7, 5] == pytest.approx(angle, rel=0.02)
+    assert _apart(joint)[0, 7] < 0.0
+
+
+def test_turns_are_of_the_days_since_whatever_the_first_day_was() -> None:
+    """The level of z is 4.5 times as large on the first day as on all others."""
+    site = Site(22)
+    watch = SiteWatch(site.gateway, BANDS_HZ)
+    for number in range(40):
+        day = site.day()
+        day.level[:] = [0.0, 0.0, 1.5 if number == 0 else 0.0]
+        watch.update(day)
+    which = [watch.steps.begins.index(20_030)]
+    value, level = watch.norm_since(which, watch.steps.step(which)[0].reshape(1, *watch.shape))
+    assert level == pytest.approx(np.zeros(level.shape), abs=1e-12)
+    assert np.abs(value[0, ..., 3:] - site.shape[..., 3:]).max() < 0.02
+    watch.steps.restart(np.ones(int(np.prod(watch.shape)), dtype=bool))
+    value, _ = watch.norm_since(which, np.zeros((1, *watch.shape)))
+    assert np.isnan(value).all(), "no day counts"
 
 
 @pytest.mark.slow
@@ -168,6 +220,7 @@ def test_a_turn_is_told_as_a_turn(learned: tuple[Site, SiteWatch]) -> None:
     assert kinds(found) == {7: "turn"}
     assert found.sensors[7].what == "turn about y"
     assert abs(found.sensors[7].size - 0.0175) < found.sensors[7].U
+    assert abs(found.sensors[7].U - 0.0035) < 0.0007, "a tenth of the angle, k = 2"
 
 
 def test_a_gateway_is_told_as_the_gateway(learned: tuple[Site, SiteWatch]) -> None:
@@ -225,14 +278,14 @@ def test_the_false_alarms_of_two_sensors_are_those_of_one_comparison() -> None:
 
 def test_a_band_of_two_sensors_names_none_where_three_are_compared_in_others() -> None:
     one, none = np.ones((1, 9, 7)), np.zeros(1)
-    step, information, G = steps_of(np.zeros((9, 6, 3)))
+    step, information, value, level = steps_of(np.zeros((9, 6, 3)))
     information[0, :7, 0, 0] = 0.0
     step[0, 7, 0, 0] = 0.5
-    told = jointly(step, information, G, one, none)
+    told = jointly(step, information, value, level, one, none)
     assert not told.pair.any()
     assert np.abs(told.statistic).max() < 1e-6
     information[0, 6, 0, 0] = 1e4
-    assert jointly(step, information, G, one, none).statistic[0, 7, 0] > 5.0
+    assert jointly(step, information, value, level, one, none).statistic[0, 7, 0] > 5.0
 
 
 def test_bands_that_change_differently_are_the_structure(learned: tuple[Site, SiteWatch]) -> None:
@@ -400,12 +453,11 @@ def test_what_was_known_before_a_change_loosens_its_test_and_nothing_since() -> 
     assert blocks.inflation()[0, 0] > 4.0, "today's is larger"
 
 
-def steps_of(z: Array) -> tuple[Array, Array, Array]:
-    """Steps (1, n, B, 6) that are z standard deviations in the outputs alone, their information, and G."""
-    G = design(np.zeros((*z.shape[:2], 6)), np.zeros((z.shape[1], 3)))
+def steps_of(z: Array) -> tuple[Array, Array, Array, Array]:
+    """Steps (1, n, B, 6) that are z standard deviations in the outputs alone, information, channels, levels."""
     step, information = np.zeros((1, *z.shape[:2], 6)), np.full((1, *z.shape[:2], 6), 1e4)
     step[0, :, :, :3] = 0.01 * z
-    return step, information, G
+    return step, information, np.zeros(step.shape), np.zeros((*step.shape[:3], 3))
 
 
 def test_what_all_sensors_differ_by_at_a_begin_is_scatter_and_one_that_changes_is_not() -> None:
@@ -423,15 +475,16 @@ def test_what_all_sensors_differ_by_at_a_begin_is_scatter_and_one_that_changes_i
 
 
 def test_a_turn_stands_without_the_band_that_says_most() -> None:
-    """Cross powers xy that move in one band are no turn about z; in all six they are."""
+    """Cross powers xy that move in one band are no turn about z; in all six they are. y moves by 1.6 times as much as
+    x: a turn by 1 rad changes the cross power by 1."""
     one, none = np.ones((1, 9, 7)), np.zeros(1)
-    step, information, G = steps_of(np.zeros((9, 6, 3)))
-    G[2, :, 3, 5] = 1.0
-    step[0, 2, 0, 3] = 0.4
-    alone = jointly(step, information, G, one, none)
+    step, information, value, level = steps_of(np.zeros((9, 6, 3)))
+    value[0, 2, :, 1] = np.log(0.5 + np.sqrt(1.25))
+    step[0, 2, 0, 3] = 0.04
+    alone = jointly(step, information, value, level, one, none)
     assert abs(alone.statistic[0, 2, 6]) < 0.1 < abs(alone.size[0, 2, 6] / alone.u[0, 2, 6])
     step[0, 2, :, 3] = 0.1
-    assert jointly(step, information, G, one, none).statistic[0, 2, 6] > 15.0
+    assert jointly(step, information, value, level, one, none).statistic[0, 2, 6] > 15.0
 
 
 def test_hours_are_merged_without_their_levels_and_without_noise() -> None:
