@@ -100,7 +100,7 @@ def run(config: Config, data_dir: Path, enough: Callable[[Run], bool], timeout_s
         finally:
             asked_s = time.monotonic()
             service.stop()
-            runner.join(10)
+            runner.join(60)
             found.stopped_s = time.monotonic() - asked_s
     assert not runner.is_alive()
     found.audit = run_audit(recordings_of([data_dir]), Engines(Pipeline.restore), as_json=False)

@@ -60,7 +60,7 @@ class Follower:
         for result in self.consumer:
             self._results.put(result)
 
-    def up_to(self, last: int, timeout_s: float = 15.0) -> list[int]:
+    def up_to(self, last: int, timeout_s: float = 60.0) -> list[int]:
         """The numbers that come until `last` is there."""
         numbers: list[int] = []
         end = time.monotonic() + timeout_s
@@ -70,7 +70,7 @@ class Follower:
 
     def stop(self) -> None:
         self.consumer.close()
-        self._thread.join(3.0)
+        self._thread.join(60.0)
         assert not self._thread.is_alive()
 
 
@@ -285,7 +285,7 @@ print("ended")
 @pytest.mark.parametrize("what", ["iterate", "leave"])
 def test_a_consumer_ends_without_a_traceback(site: Site, what: str) -> None:
     command = [sys.executable, "-c", CONSUMING, site.endpoint, what]
-    told = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (told.returncode, told.stdout, told.stderr) == (0, "ended\n", "")
 
 
