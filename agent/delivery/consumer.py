@@ -304,18 +304,18 @@ class Consumer:
     def _read_sample(self, sample: zenoh.Sample) -> tuple[Received | None, int]:
         """(the result, or None where it is none or is refused; the number that it claims, otherwise 0)."""
         attachment = sample.attachment.to_bytes() if sample.attachment is not None else None
-        parts = str(sample.key_expr), sample.payload.to_bytes(), attachment
+        key, payload = str(sample.key_expr), sample.payload.to_bytes()
+        signed = (attachment or b"").partition(b"\n")[2]
         try:
-            result = receive(*parts, self._verifier)
+            result = receive(key, payload, attachment, self._verifier)
         except UnverifiedError as error:
-            source = "/".join(parts[0].split("/")[2:4])
-            self._refusals.count(source, str(error))
-            return None, number_of(parts[1])
+            self._refusals.count("/".join(key.split("/")[2:4]), str(error), payload, signed)
+            return None, number_of(payload)
         if result is None:
-            if (address := parse_key(parts[0])) is None or not address.is_result:
+            if (address := parse_key(key)) is None or not address.is_result:
                 return None, 0
-            self._malformed.count(address.source, "it has not the fields and numbers of its kind")
-            return None, number_of(parts[1])
+            self._malformed.count(address.source, "it has not the fields and numbers of its kind", payload, signed)
+            return None, number_of(payload)
         if result.altered:
             what = "%s: the JSON of result %d says something else than its signed bytes: %s"
             _log.warning(what, result.address.source, result.sequence, ", ".join(result.altered))

@@ -17,6 +17,7 @@ from agent.recording.result_signing import SignedResult
 from agent.recording.signed_text import SignedTextError
 
 GATEWAYS_MAX = 1000  # named in counts, and trusted at their first result; strangers may invent names for ever
+REFUSED_MAX = 10_000  # newest refused results that are known again
 
 
 class UnverifiedError(Exception):
@@ -24,14 +25,27 @@ class UnverifiedError(Exception):
 
 
 class Refusals:
-    """Counts results that were not verified, by gateway, and logs one of them in a while."""
+    """Counts results that were not verified, by gateway, and logs one of them in a while.
+
+    A result comes as a message, and again in each answer of its gateway's store. It counts once.
+    """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
+        self._refused: dict[int, None] = {}  # hashes, the oldest first
         self._log = Seldom()
 
-    def count(self, source: str, reason: str) -> None:
-        """Count a result of a gateway. Of gateways beyond GATEWAYS_MAX the count is common, under the name ""."""
+    def count(self, source: str, reason: str, *result: bytes) -> None:
+        """Count a result of a gateway, given as its JSON and what was signed, unless it was counted before.
+
+        Of gateways beyond GATEWAYS_MAX the count is common, under the name "".
+        """
+        identity = hash((source, *result))
+        if identity in self._refused:
+            return
+        self._refused[identity] = None
+        if len(self._refused) > REFUSED_MAX:
+            del self._refused[next(iter(self._refused))]
         self.counts[source if source in self.counts or len(self.counts) < GATEWAYS_MAX else ""] += 1
         told = "a result published as one of %s is refused: %s (%d refused so far)"
         self._log.warning(told, source, reason, self.counts.total())

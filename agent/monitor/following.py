@@ -250,7 +250,7 @@ class Following:
         try:
             guide = read_guide(sample.payload.to_bytes(), signed, address.source, self._known)
         except UnverifiedError as error:
-            self._refused_guides.count(address.source, str(error))
+            self._refused_guides.count(address.source, str(error), sample.payload.to_bytes(), signed)
             return
         if guide is not None:
             self.benches.take(address.site, address.gateway, guide)

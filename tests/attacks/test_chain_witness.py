@@ -184,7 +184,7 @@ def test_a_head_reaches_the_witness_over_the_network(tmp_path: Path) -> None:
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
             wait_for((kept / f"{GATEWAY}.heads").exists)
             process.terminate()
-            said = process.communicate(timeout=30)[0]
+            said = process.communicate(timeout=60)[0]
         with site.client() as client:
             assert [r.ok.payload.to_bytes() for r in client.get("fieldcal/v1/*/*/head") if r.ok] == [head]
     finally:

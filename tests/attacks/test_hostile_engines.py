@@ -75,12 +75,12 @@ def test_hostile_content_is_named_and_does_nothing(content: str, tmp_path: Path)
     for name in ("sitecustomize.py", "usercustomize.py", "numpy.py", "agent.py"):
         (engines / name).write_text(WRITES.format(str(mark)))
     (engines / "evil.pth").write_text(f"import os; os.close(os.open({str(mark)!r}, os.O_CREAT))\n")
-    before, begin = sorted(os.listdir(engines)), time.monotonic()
+    before, begin = sorted(os.listdir(engines)), time.process_time()
     found = find_engine(ID, [engines], ["f" * 64])
     assert isinstance(found, str)
     assert str(engines / file_name(ID)) in found
     assert told in found
-    assert time.monotonic() - begin < 2
+    assert time.process_time() - begin < 2
     assert sorted(os.listdir(engines)) == before
     assert not mark.exists()
 

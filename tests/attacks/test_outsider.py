@@ -78,7 +78,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = fieldcal("run", directory / "config.toml", "--data-dir", directory / "data", "--duration", "5")
     assert done.returncode == 0, done.stderr
     consumer.close()
-    iterating.join(10.0)
+    iterating.join(60.0)
     router.kill()
     assert consumer.refused == {}
     (directory / "received").write_bytes(msgspec.msgpack.encode([result.signed for result in received]))

@@ -146,7 +146,7 @@ def test_whatever_the_program_prints_is_guarded(tmp_path: Path) -> None:
     except OSError:
         pass
     os.close(mine)
-    assert process.wait(20) == 0
+    assert process.wait(60) == 0
     text = re.sub(r"\x1b\[[0-9;]*m", "", told.decode()).replace("\r\n", "")
     assert "\\u001b]0;owned\\u0007" in text
     harmless(text)

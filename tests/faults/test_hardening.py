@@ -214,10 +214,10 @@ def test_the_agent_calibrates_publishes_and_records(data_dir: Path, port: PtyDev
             wait_until(lambda: systemd.told() and (agent.poll() or results(data, "calibration")), 60, "S and Q")
             assert agent.poll() is None, log.read_text()
             published = wait_until(subscriber.try_recv, 10, "S and Q on the network")
-            with urllib.request.urlopen(f"http://127.0.0.1:{metrics_port}/metrics", timeout=5) as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{metrics_port}/metrics", timeout=60) as answer:
                 scraped = answer.read().decode()
             agent.terminate()
-            assert agent.wait(10) == 0
+            assert agent.wait(60) == 0
         finally:
             agent.kill()
             agent.wait()

@@ -41,7 +41,7 @@ def _answered(process: subprocess.Popen[bytes], answer: Answer) -> tuple[int, st
                 continue
             data = process.stdout.read1(65536)  # type: ignore[attr-defined]
             if not data:
-                return process.wait(10), told
+                return process.wait(60), told
             told += data.decode()
             if told.endswith("> "):
                 process.stdin.write(f"{answer(told[seen:])}\n".encode())

@@ -167,7 +167,7 @@ def test_a_wrong_chip_is_named_and_does_not_stop_the_agent(tmp_path: Path, capsy
             wait_until(lambda: "INVALID" in statuses(tmp_path), 60, "the status says it")
         finally:
             service.stop()
-            runner.join(10)
+            runner.join(60)
     assert not runner.is_alive()
     said = capsys.readouterr().out
     assert "0x1D" in said

@@ -342,7 +342,7 @@ def test_a_page_hears_its_monitor_while_nothing_changes(
         page = watched.open()
         alive = "new EventSource('api/changes').addEventListener('alive', () => { heard += 1; })"
         page.evaluate(f"() => {{ window.heard = 0; {alive}; }}")
-        page.wait_for_function("() => heard > 1", timeout=10_000)
+        page.wait_for_function("() => heard > 1")
         watched.close()
 
 
@@ -456,7 +456,7 @@ def test_more_tabs_than_a_browser_has_connections_and_a_copied_line_without_http
         pages = [first, *(watched.context.new_page() for _ in range(TABS - 1))]
         for page in pages:
             page.goto(f"http://{served.address}/")
-            page.get_by_text("Sensors: 0").wait_for(timeout=5000)
+            page.get_by_text("Sensors: 0").wait_for()
             if page is not pages[-1]:
                 page.evaluate(HIDE)
         keep(served, "mems", calibration(1), status(2, "HELD"))

@@ -57,7 +57,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
             late, clocks = late_client(KEY), late_client(CLOCK_KEY + "?after=0")
             stopped_in_s = interrupt(process)
         subscriber.undeclare()
-        taker.join(5.0)
+        taker.join(60.0)
     return Run(data_dir, output.read_text(), live, late, clocks, stopped_in_s, process.returncode)
 
 

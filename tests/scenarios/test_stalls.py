@@ -87,7 +87,7 @@ def _run_and_look(config: Config, tmp_path: Path) -> None:
             assert len(gc.get_objects()) < FEW
         finally:
             service.stop()
-            runner.join(10)
+            runner.join(60)
     assert not runner.is_alive()
     assert len(gc.get_objects()) > 4 * FEW
 

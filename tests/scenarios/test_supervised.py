@@ -108,7 +108,7 @@ def test_it_tells_how_it_is_from_beginning_to_end(
         subscriber = client.declare_subscriber("fieldcal/v1/site/gw/status", zenoh.handlers.RingChannel(100))
         wait_until(lambda: systemd.has("READY=1"), 60, "ready")
         wait_until(lambda: systemd.has("STATUS=running; imu "), 60, "a status with the rate")
-        assert systemd.fed_within(WATCHDOG_S / 2)
+        wait_until(lambda: systemd.fed_within(WATCHDOG_S / 2), 60, "fed")
         imu.unplug()
         wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 60, "degraded")
         assert not systemd.fed_within(2 * WATCHDOG_S), "nothing flows"
@@ -117,7 +117,7 @@ def test_it_tells_how_it_is_from_beginning_to_end(
         wait_until(lambda: systemd.has("STATUS=running", plugged_s), 60, "running again")
         wait_until(lambda: systemd.fed_within(WATCHDOG_S / 2), 60, "fed again")
         agent.terminate()
-        assert agent.wait(5) == 0
+        assert agent.wait(60) == 0
         assert systemd.has("STOPPING=1")
         states = []
         while (sample := subscriber.try_recv()) is not None:
@@ -141,7 +141,7 @@ def test_an_agent_that_stands_still_does_not_feed(systemd: Systemd, agent: subpr
     systemd.has("")
     assert not systemd.fed_within(1.5 * WATCHDOG_S)
     agent.send_signal(signal.SIGCONT)
-    assert systemd.fed_within(WATCHDOG_S)
+    wait_until(lambda: systemd.fed_within(WATCHDOG_S), 60, "fed again")
 
 
 @pytest.mark.thorough
@@ -153,4 +153,4 @@ def test_an_absent_device_does_not_keep_it_from_being_ready(
     wait_until(lambda: systemd.has("STATUS=degraded: imu is lost"), 60, "it says what is missing")
     assert not systemd.has("WATCHDOG=1")
     agent.terminate()
-    assert agent.wait(5) == 0
+    assert agent.wait(60) == 0

@@ -112,7 +112,7 @@ def of(device: str, seen: list[object]) -> list[SampleBlock]:
 def test_probe_names_who_answers(site: UmockdevSite, bus: I2CBus) -> None:
     bus.claimed.add(0x68)
     process = program(site, "probe", "--json", "-")
-    out, _ = process.communicate(timeout=30)
+    out, _ = process.communicate(timeout=60)
     assert process.returncode == 0, out
     (found,) = json.loads(out)["i2c"]
     assert (found["number"], found["fault"]) == (1, "")
@@ -126,7 +126,7 @@ def test_probe_names_who_answers(site: UmockdevSite, bus: I2CBus) -> None:
 
 def test_probe_names_a_bus_that_is_not_there(site: UmockdevSite) -> None:
     process = program(site, "probe", "--bus", "7")
-    out, _ = process.communicate(timeout=30)
+    out, _ = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "/dev/i2c-7 does not exist; state a bus" in out
 
@@ -134,11 +134,11 @@ def test_probe_names_a_bus_that_is_not_there(site: UmockdevSite) -> None:
 @pytest.mark.thorough
 def test_check_and_doctor_ask_the_devices(tmp_path: Path, site: UmockdevSite, bus: I2CBus, port: PtyDevice) -> None:
     config = configuration(tmp_path, port)
-    out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+    out, _ = (process := program(site, "check", config)).communicate(timeout=60)
     assert process.returncode == 0, out
     assert "  adxl355: ADXL355 (REVID 0x01) answers on /dev/i2c-1, one register read a transfer" in out.splitlines()
     del bus.targets[0x6A]
-    out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+    out, _ = (process := program(site, "check", config)).communicate(timeout=60)
     assert process.returncode == 0, out
     assert "lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: no device answers (Remote I/O error)" in out
     process = program(site, "doctor", config, "--data-dir", tmp_path / "data", "--json", "-")
@@ -147,7 +147,7 @@ def test_check_and_doctor_ask_the_devices(tmp_path: Path, site: UmockdevSite, bu
     assert said["mpu6050: MPU-6050 (WHO_AM_I 0x68) answers on /dev/i2c-1, one register read a transfer"] == "good"
     assert said["lsm6dso: LSM6DSO at 0x6A on /dev/i2c-1: no device answers (Remote I/O error)"] == "fault"
     bus.adapter = Adapter("single bytes", functions=SMBUS_FUNCTIONS & ~I2cFunc.SMBUS_READ_I2C_BLOCK)
-    out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+    out, _ = (process := program(site, "check", config)).communicate(timeout=60)
     assert process.returncode == 2, out
     assert "the adapter can neither do plain I2C transfers nor read an I2C block over SMBus" in out
 
@@ -159,17 +159,17 @@ def test_who_uses_a_device_is_told(tmp_path: Path, site: UmockdevSite, port: Pty
     running = program(site, "run", config, "--data-dir", data_dir)
     try:
         wait_until(lambda: all(of(name, events(data_dir)) for name in DEVICES), 60, "samples of all come")
-        out, _ = (process := program(site, "probe", "--json", "-")).communicate(timeout=30)
+        out, _ = (process := program(site, "probe", "--json", "-")).communicate(timeout=60)
         assert process.returncode == 0, out
         used = {answer["address"]: answer["used_by"] for answer in json.loads(out)["i2c"][0]["answers"]}
         assert set(used) == {0x18, 0x1D, 0x53, 0x68, 0x69, 0x6A}
         assert all(f"process {running.pid} (" in by for by in used.values())
         process = program(site, "run", config, "--data-dir", tmp_path / "second", "--duration", "2")
-        out, _ = process.communicate(timeout=30)
+        out, _ = process.communicate(timeout=60)
         assert f"ADXL355 at 0x1D on /dev/i2c-1: process {running.pid} (" in out
     finally:
         interrupt(running)
-        running.communicate(timeout=30)
+        running.communicate(timeout=60)
 
 
 def test_a_run_loses_no_sample_of_any_device(tmp_path: Path, site: UmockdevSite, port: PtyDevice) -> None:
@@ -208,7 +208,7 @@ def test_unplugged_and_back_it_goes_on(tmp_path: Path, site: UmockdevSite, bus: 
         )
     finally:
         interrupt(process)
-        out, _ = process.communicate(timeout=30)
+        out, _ = process.communicate(timeout=60)
     assert process.returncode == 0, out
     assert "Traceback" not in out
     seen = events(data_dir)
@@ -246,11 +246,11 @@ def test_the_same_chips_over_spi(tmp_path: Path) -> None:
     config, data_dir = tmp_path / "gateway.toml", tmp_path / "data"
     config.write_text("".join(lines))
     with UmockdevSite(buses) as site:
-        out, _ = (process := program(site, "probe", "--json", "-")).communicate(timeout=30)
+        out, _ = (process := program(site, "probe", "--json", "-")).communicate(timeout=60)
         assert process.returncode == 0, out
         assert [one["bus"] for one in json.loads(out)["spi"]] == ["spi0.0", "spi0.1", "spi0.2"]
         assert all(bus.bytes == 0 for bus in buses.values())
-        out, _ = (process := program(site, "check", config)).communicate(timeout=30)
+        out, _ = (process := program(site, "check", config)).communicate(timeout=60)
         assert process.returncode == 0, out
         assert "  adxl345: ADXL345 (DEVID 0xE5) answers on /dev/spidev0.1, one register read a transfer" in out
         process = program(site, "doctor", config, "--data-dir", data_dir, "--json", "-")

@@ -38,7 +38,7 @@ NOT_MINE = -100 & 0xFFFFFFFFFFFFFFFF  # return value with which the library make
 def absence() -> str | None:
     """Why umockdev cannot be used on this machine; None if it can."""
     done = subprocess.run(
-        ["/bin/true"], env={"LD_PRELOAD": LIBRARY}, capture_output=True, text=True, timeout=10, check=False
+        ["/bin/true"], env={"LD_PRELOAD": LIBRARY}, capture_output=True, text=True, timeout=60, check=False
     )
     return f"no umockdev here (apt-get install umockdev): {done.stderr.strip()}" if done.stderr else None
 

@@ -32,7 +32,7 @@ from agent.monitor.settings import FloorPlan
 from agent.monitor.site_watching import SiteWatching
 from tests.unit.zenoh_site import Site, wait_for
 
-STARTS_S = 30.0
+STARTS_S = 60.0
 
 
 class Answer:
@@ -97,7 +97,7 @@ class Served(AbstractContextManager["Served"]):
         self, path: str, method: str = "GET", body: bytes | str = b"", headers: Mapping[str, str] | None = None
     ) -> Answer:
         """One request, with the path exactly as it is given."""
-        with closing(http.client.HTTPConnection(self.address, timeout=10)) as connection:
+        with closing(http.client.HTTPConnection(self.address, timeout=60)) as connection:
             given = {name.lower(): value for name, value in (headers or {}).items()}
             connection.putrequest(method, path, skip_host="host" in given, skip_accept_encoding=True)
             data = body.encode() if isinstance(body, str) else body
@@ -142,7 +142,7 @@ class Monitor:
         return True
 
     def get(self, path: str) -> Any:
-        with urlopen(f"{self.url}/{path}", timeout=5, context=self.tls) as answer:
+        with urlopen(f"{self.url}/{path}", timeout=60, context=self.tls) as answer:
             assert answer.headers["Content-Security-Policy"].startswith("default-src 'self'")
             text = answer.read().decode()
         return json.loads(text) if path.startswith("api") else text
@@ -163,7 +163,7 @@ class Monitor:
     def stop(self, number: signal.Signals = signal.SIGINT) -> str:
         """Ctrl-C, or another signal; returns the log. Fails where the program does not end well."""
         self._process.send_signal(number)
-        said = self._process.communicate(timeout=10)[1].decode()
+        said = self._process.communicate(timeout=60)[1].decode()
         assert (self._process.returncode, "Traceback" in said, "FATAL" in said) == (0, False, False), said
         return said
 

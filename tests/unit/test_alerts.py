@@ -143,7 +143,7 @@ def prometheus(tmp_path: Path) -> Iterator[str]:
 
 
 def ask(address: str, path: str, **arguments: str) -> Any:
-    with urllib.request.urlopen(f"{address}/api/v1/{path}?{urllib.parse.urlencode(arguments)}", timeout=10) as answer:
+    with urllib.request.urlopen(f"{address}/api/v1/{path}?{urllib.parse.urlencode(arguments)}", timeout=60) as answer:
         return json.load(answer)["data"]
 
 

@@ -54,7 +54,7 @@ def site(tmp_path: Path) -> Path:
 
 
 def run(directory: Path, *words: str) -> int:
-    return subprocess.run(words, cwd=directory, capture_output=True, timeout=20, check=False).returncode
+    return subprocess.run(words, cwd=directory, capture_output=True, timeout=60, check=False).returncode
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed")

@@ -106,7 +106,7 @@ def test_the_readme_fits_on_a_screen() -> None:
     assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 60
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.skipif(not (ROOT / ".venv-docs/bin/mkdocs").exists(), reason="`make site` was never run here")
 def test_a_warning_is_an_error(tmp_path: Path) -> None:
     for name in ("docs", "CONTRIBUTING.md", "CHANGELOG.md", "mkdocs.yml", "README.md"):

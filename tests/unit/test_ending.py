@@ -47,7 +47,7 @@ def ended(code: str, **streams: int) -> subprocess.CompletedProcess[str]:
     """A program with this code, at its end."""
     given: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | streams
     buffered = os.environ | {"PYTHONUNBUFFERED": ""}
-    return subprocess.run([sys.executable, "-c", code], text=True, timeout=30, check=False, env=buffered, **given)
+    return subprocess.run([sys.executable, "-c", code], text=True, timeout=60, check=False, env=buffered, **given)
 
 
 def test_a_thread_that_waits_in_zenoh_does_not_abort_the_process() -> None:

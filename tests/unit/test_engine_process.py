@@ -164,7 +164,7 @@ def test_thread_of_an_engine_is_allowed() -> None:
 def test_engine_that_does_not_end_is_ended(does: str, limits: ProcessLimits, told: str) -> None:
     begin = time.monotonic()
     assert told in begun(does, limits)
-    assert time.monotonic() - begin < 10
+    assert time.monotonic() - begin < 50  # by itself the one that sleeps ends after 60 s
 
 
 @pytest.mark.parametrize(

@@ -55,8 +55,8 @@ def init(path: Path, port: str, *options: str) -> int:
 
 
 def read(sensor: Sensor, samples: int) -> Iterator[SampleBlock]:
-    """Blocks until they hold so many samples; in ten seconds they must have come."""
-    ends_s = time.monotonic() + 10.0
+    """Blocks until they hold so many samples; in a minute they must have come."""
+    ends_s = time.monotonic() + 60.0
     while samples > 0:
         assert time.monotonic() < ends_s, f"{samples} samples are missing"
         block = sensor.read_block()

@@ -144,12 +144,12 @@ def test_over_https_a_user_logs_in_with_a_cookie_of_this_host(tmp_path: Path) ->
         idle.enter_context(many(monitor.address, 1024))
         body = json.dumps({"name": "anna", "password": "correct horse battery staple"}).encode()
         login = Request(f"{monitor.url}/api/login", body, {"Origin": monitor.url})
-        with urlopen(login, timeout=10, context=monitor.tls) as answer:
+        with urlopen(login, timeout=60, context=monitor.tls) as answer:
             cookie = answer.headers["Set-Cookie"].split(";")
         assert cookie[0].startswith("__Host-fieldcal=")
         assert {"secure", "httponly", "samesite=strict"} <= {part.strip().lower() for part in cookie[1:]}
         asked = Request(f"{monitor.url}/api/fleet", headers={"Cookie": cookie[0]})
-        with urlopen(asked, timeout=10, context=monitor.tls) as answer:
+        with urlopen(asked, timeout=60, context=monitor.tls) as answer:
             assert json.loads(answer.read())["sensors"] == []
         with pytest.raises(HTTPError, match="401"):
             monitor.get("api/fleet")

@@ -87,7 +87,7 @@ def test_telegraf_and_grafana_know_the_topics_and_the_fields() -> None:
 
 def ask(address: str, **query: str) -> Any:
     data = urllib.parse.urlencode(query).encode()
-    with urllib.request.urlopen(urllib.request.Request(f"{address}/query", data), timeout=10) as answer:
+    with urllib.request.urlopen(urllib.request.Request(f"{address}/query", data), timeout=60) as answer:
         return json.loads(answer.read())
 
 

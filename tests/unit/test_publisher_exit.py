@@ -33,13 +33,13 @@ print("ready", flush=True)
 sys.stdin.readline()
 if sys.argv[3] == "raise":
     raise RuntimeError("an agent that fails")
-for n in range(2, 400):
-    big = record(n, text="x" * 60_000)
-    store.commit([big])
+bigs = [record(n, text="x" * 900_000) for n in range(2, 42)]  # the buffers of a link hold a few of them
+store.commit(bigs)
+for big in bigs:
     publisher.publish(big)
 begin = time.monotonic()
 closed = publisher.close()
-print(time.monotonic() - begin, closed, store.published() < 399, flush=True)
+print(time.monotonic() - begin, closed, store.published() < 41, flush=True)
 os._exit(0)
 """
 
@@ -57,7 +57,7 @@ def agent_process(tmp_path: Path, endpoint: str, way: str) -> subprocess.Popen[s
 @pytest.mark.slow
 def test_the_interpreter_exits_though_the_publisher_was_never_closed(site: Site, tmp_path: Path) -> None:
     agent = agent_process(tmp_path, site.endpoint, "raise")
-    _, faults = agent.communicate("\n", timeout=5)
+    _, faults = agent.communicate("\n", timeout=60)
     assert agent.returncode == 1
     assert "RuntimeError: an agent that fails" in faults
 
@@ -72,10 +72,10 @@ def test_close_is_bounded_while_a_frozen_router_holds_a_put_up(tmp_path: Path) -
             subscriber = client.declare_subscriber("fieldcal/v1/**", zenoh.handlers.RingChannel(10))
             agent = agent_process(tmp_path, endpoint, "close")
             os.kill(router.pid, signal.SIGSTOP)
-            said, _ = agent.communicate("\n", timeout=20)
+            said, _ = agent.communicate("\n", timeout=60)
             took_s, closed, held_up = said.split()
             assert (closed, held_up) == ("False", "True")
-            assert float(took_s) < 1.5
+            assert float(took_s) < 4.5  # it waits for 1.2 s; the put is held up for 5 s
             assert agent.returncode == 0
             router.kill()  # so that the client can close
             subscriber.undeclare()

@@ -84,7 +84,7 @@ class Bus(EventQueue):
                 wait_until(seen, 120.0, "the self-test", 0.01)
             finally:
                 reader.stop()
-                reader.join(5.0)
+                reader.join(60.0)
         return self.found
 
     @property

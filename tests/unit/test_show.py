@@ -133,7 +133,7 @@ def test_a_reader_who_may_not_write_sees_a_store_that_was_closed(tmp_path: Path)
     try:
         copy.chmod(0o555)
         said = subprocess.run(
-            [sys.executable, "-c", command, copy, tmp_path], capture_output=True, text=True, timeout=20
+            [sys.executable, "-c", command, copy, tmp_path], capture_output=True, text=True, timeout=60
         )
     finally:
         copy.chmod(0o755)
