@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import Any, Protocol, TypeVar
 
 from calib.recorded.errors import InputError
@@ -217,8 +218,7 @@ class Choice:
     def in_their_order(self, three: Sequence[ChosenColumn]) -> Sequence[ChosenColumn]:
         """The three columns as x, y and z. Raises InputError where their names tell another order."""
         told = [_way(c.column) for c in three]
-        numbers = [int(word) if word.isdigit() else ord(word) for word in told if word.isdigit() or len(word) == 1]
-        if (len(numbers) == len(AXES) and numbers != sorted(numbers)) or any(map(_COMPASS["z"].fullmatch, told[:2])):
+        if _in_another_order(told) or any(map(_COMPASS["z"].fullmatch, told[:2])):
             names = ", ".join(repr(str(c.column)) for c in three)
             raise self.fault(f"the names {names} tell another order than x, y, z")
         return three
@@ -241,6 +241,13 @@ def quantity_of(chosen: ChosenColumn) -> str | None:
 
 def _unit(column: Column) -> str:
     return column.unit or split(column.name)[1]
+
+
+def _in_another_order(told: Sequence[str]) -> bool:
+    """Whether three numbers, or three letters that follow each other in the alphabet, do not increase."""
+    if all(word.isdigit() for word in told):
+        return [int(word) for word in told] != sorted(map(int, told))
+    return "".join(sorted(told)) in ascii_lowercase and list(told) != sorted(told)
 
 
 def _way(column: Column) -> str:

@@ -121,7 +121,7 @@ def test_a_reference_without_gravity_and_without_unit(unit: float, tmp_path: Pat
     [
         ("Ch1,Ch2,Ch3", "123"), ("AI 8,AI 9,AI 10", "123"), ("NS,EW,UD", "213"),
         ("Acc U-D (mV),Acc N-S (mV),Acc E-W (mV)", "321"),
-        ("Longitudinal,Lateral,Vertical", "123"),
+        ("Longitudinal,Lateral,Vertical", "123"), ("N,E,D", "123"), ("A,B,C", "123"),
         ("Ch3,Ch1,Ch2", ""), ("acc3,acc2,acc1", ""), ("C,A,B", ""), ("AI 10,AI 9,AI 8", ""),
         ("Vertical,Longitudinal,Lateral", ""),
     ],
