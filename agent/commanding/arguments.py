@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Annotated, Literal, get_args
 
 import msgspec
 
 from agent.commanding.refusal import Refused
+from agent.config.strict_json import strict
 
 Verb = Literal["pose", "hold", "accept", "rollback"]
 VERBS: tuple[Verb, ...] = get_args(Verb)
@@ -73,22 +73,10 @@ _DECODERS: dict[Verb, msgspec.json.Decoder[Arguments]] = {
 }
 
 
-def refuse_doubled_keys(text: bytes | str) -> None:
-    """Raise ValueError where an object in a JSON text has a key twice: two readers could see two different commands."""
-    json.loads(text, object_pairs_hook=_once_each)
-
-
-def _once_each(pairs: list[tuple[str, object]]) -> None:
-    names = [name for name, _ in pairs]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the key {twice!r} is there twice")
-
-
 def parse_arguments(verb: Verb, text: bytes | str) -> Arguments:
     """Read the arguments of a command from JSON. Raises Refused, which names the field."""
     try:
-        refuse_doubled_keys(text)
+        strict(text)
         return _DECODERS[verb].decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise Refused("out of limits", f"{verb}: {error}") from None

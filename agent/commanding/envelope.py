@@ -18,8 +18,9 @@ import msgspec
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-from agent.commanding.arguments import Arguments, Verb, refuse_doubled_keys
+from agent.commanding.arguments import Arguments, Verb
 from agent.commanding.refusal import Refused
+from agent.config.strict_json import strict
 
 LARGEST = 4096  # bytes of a command; the longest pose takes 400
 _MARK = b"fieldcal-command-1"
@@ -64,7 +65,7 @@ class Envelope:
         except InvalidSignature:
             raise Refused("bad signature", f"the signature was not made with key {self.key_id}") from None
         try:
-            refuse_doubled_keys(self.body)
+            strict(self.body)
             return _ORDER.decode(self.body)
         except (msgspec.DecodeError, ValueError, RecursionError) as error:
             raise Refused("malformed", f"not a command: {error}") from None

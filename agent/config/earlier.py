@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agent.config.files import read_file
+from agent.config.strict_json import strict
 from agent.config.xml import XmlError, check_xml
 from calib.model import PARAMETERS, Array
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 LARGEST = 64 << 20  # bytes; a result lists all its windows, each with 0.3 kB
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"  # namespaces
 PARAMETER_LIST, COVARIANCE = "fieldcal_parameters", "fieldcal_covariance"  # refType of what is ours in a DCC
+LARGEST_VALUE = 1e60  # of a sensitivity, an offset or a variance; products of several of them stay finite
+ASYMMETRIC = 1e-6  # relative to the standard uncertainties; values are written with more digits
+TINY = np.finfo(float).tiny
 MAIN = [0, 4, 8]  # places of the main sensitivities among the parameters
 
 
@@ -35,7 +39,8 @@ def read_earlier(path: Path, *, joint: bool = False) -> tuple[Array, Array]:
     """
     try:
         data = read_file(path, LARGEST)
-        return _from_xml(data) if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") else _from_json(data, joint)
+        is_xml = data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+        return _checked(*(_from_xml(data) if is_xml else _from_json(data, joint)))
     except OSError as error:
         raise EarlierError(f"{path}: {error.strerror}") from None
     except _OtherXmlError as error:
@@ -73,15 +78,33 @@ class _OtherXmlError(Exception):
 
 
 def _from_json(data: bytes, joint: bool) -> tuple[Array, Array]:
-    told: dict[str, Any] = json.loads(data)
+    told: dict[str, Any] = strict(data)
     if "certificate" in told:
         told = told["certificate"]["result"]
     if joint:
         told = told.get("joint") or told
-    S, Q, covariance = (np.array(told[name], dtype=float) for name in ("sensitivity", "offset", "covariance"))
+    S, Q, covariance = (_numbers(told, name) for name in ("sensitivity", "offset", "covariance"))
     if (S.shape, Q.shape, covariance.shape) != ((3, 3), (3,), (12, 12)):
         raise ValueError("sensitivity must have 3 x 3 numbers, offset 3 and covariance 12 x 12")
     return np.append(S.ravel(), Q), covariance
+
+
+def _numbers(told: dict[str, Any], name: str) -> Array:
+    """Numbers, and NaN for null; texts and booleans are none. Raises ValueError."""
+    values = np.array(told[name], dtype=object)
+    if not all(value is None or type(value) in (int, float) for value in values.ravel()):
+        raise ValueError(f"{name} must have numbers or null alone")
+    return values.astype(float)
+
+
+def _checked(values: Array, covariance: Array) -> tuple[Array, Array]:
+    """The same. Raises ValueError where they are no values with a covariance."""
+    if np.nanmax(np.abs(np.append(values, covariance)), initial=0.0) > LARGEST_VALUE:
+        raise ValueError(f"a value is larger than {LARGEST_VALUE:g}")
+    u = np.sqrt(np.abs(np.diag(covariance)))
+    if np.nanmax(np.abs(covariance - covariance.T) / np.maximum(np.outer(u, u), TINY), initial=0.0) > ASYMMETRIC:
+        raise ValueError("the covariance is not symmetric")
+    return values, covariance
 
 
 def _parsed(data: bytes) -> Element:

@@ -29,6 +29,7 @@ from agent.reading.dialect import (
     TableColumn,
     dialect_of_text,
     lines_of,
+    names_columns,
     names_time,
     separates_thousands,
 )
@@ -174,7 +175,13 @@ class Delimited(Source):
             told.pop()
         parsed = []
         for number, content in told:
-            fields = fields_of(self.path, number, dialect.fields(content), dialect.header)
+            found = dialect.fields(content)
+            if names_columns(found):
+                raise TableError(
+                    f"{self.path}, line {number}: {content!r:.70} has words and no value; if columns or units are "
+                    "others from here on, cut the file here, else remove the line"
+                )
+            fields = fields_of(self.path, number, found, dialect.header)
             parsed.append([number_of(self.path, number, dialect, k, fields[k]) for k in places])
         return np.array(parsed).reshape(-1, len(places))
 

@@ -30,7 +30,8 @@ NO_NUMBERS = frozenset(("nan", "-nan", "na", "n/a", "#n/a", "null", "none"))
 # Cells of loggers where a value is missing or was outside the range.
 MISSING = NO_NUMBERS | {
     "", "-", "--", "---", "----", "-----", "over", "+over", "-over", "ol", "+ol", "-ol", "overrange", "overload",
-    "#n/v", "no data", "nodata", "burnout", "+++++++", "-------", "+++++", "*****", "******",
+    "#n/v", "no data", "nodata", "burnout", "+++++++", "-------", "+++++", "*****", "******", "overrun", "overflow",
+    "1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind",
 }  # fmt: skip
 COMMENT_COLUMNS = frozenset(("comment", "comments", "note", "notes", "event", "events", "marker", "annotation"))
 # Rows below the names that are none: units and kinds of values, as TOA5 and others have them.
@@ -206,7 +207,7 @@ def _first_row(split: Sequence[tuple[int, list[str]]], enough: Callable[[Sequenc
         if k < after or not all(enough(row) for row in rows[k : k + 2]):
             continue
         soon = rows[k : k + HEAD_ROWS]
-        named = next((n for n, row in enumerate(soon) if _names_columns(row)), 0)
+        named = next((n for n, row in enumerate(soon) if names_columns(row)), 0)
         if named and all(_words_in(row) - usual for row in soon[:named]):
             after = k + named
             continue
@@ -220,7 +221,7 @@ def _usual_words(rows: Sequence[list[str]], enough: Callable[[Sequence[str]], bo
     return {k for k, count in worded.items() if 2 * count > sum(map(enough, rows))}
 
 
-def _names_columns(fields: Sequence[str]) -> bool:
+def names_columns(fields: Sequence[str]) -> bool:
     """Whether a line has several words and no value."""
     return len(_words_in(fields)) > 1 and not any(map(_is_value, fields))
 
@@ -432,7 +433,7 @@ def _is_data(line: str, delimiter: str) -> bool:
 
 def _fields(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
-        return [found[1] or found[2] for found in _BETWEEN_BLANKS.finditer(line)] if '"' in line else line.split()
+        return [found[1] or found[2] or "" for found in _BETWEEN_BLANKS.finditer(line)] if '"' in line else line.split()
     try:
         return [
             f.strip() for f in next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter, skipinitialspace=True), [])

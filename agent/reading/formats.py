@@ -52,6 +52,15 @@ FORMATS = (
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 BAGS = FORMATS[:3]
+# What is not read: how such a file begins, what it is, and what to do with it.
+NOT_READ = (
+    (rb'"?TOB[123]"?[,\s]', "TOB, the binary format of Campbell Scientific", "convert it to TOA5 (CardConvert)"),
+    (rb"\x1f\x8b|BZh|\xfd7zXZ\x00|\x28\xb5\x2f\xfd|PK\x03\x04|7z\xbc\xaf", "a compressed file", "unpack it"),
+    (rb"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "a file of Office before 2007", "write it as .xlsx or CSV"),
+    (rb"\xff\xfe\x00\x00|\x00\x00\xfe\xff", "text in UTF-32", "write it in UTF-8"),
+    (rb'(?:\xef\xbb\xbf)?\s*(?:\{\s*["}]|\[\s*[\[{])', "JSON", "write it as CSV"),
+    (rb"(?:\xef\xbb\xbf)?\s*<(?:\?xml|!DOCTYPE|html)", "XML or HTML", "write it as CSV"),
+)
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")
 LONGEST_BEGIN = 1024
 
@@ -80,6 +89,8 @@ def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role =
     except OSError as error:
         raise TableError(f"{path}: {error.strerror}") from None
     form = format_of(path, begin)
+    if form is TEXT:
+        _refuse_unread(path, begin)
     module, _, name = form.opens.partition(":")
     opened: Callable[..., Source] = getattr(importlib.import_module(module), name)
     if described.metadata is not None and form.name != "MiniSEED":
@@ -99,6 +110,12 @@ def open_source(path: Path, described: Description = NOT_DESCRIBED, role: Role =
             f"{path}: {form.name} files need {error.name}, which is not installed: "
             f"fieldcal extras --install {form.extra}"
         ) from None
+
+
+def _refuse_unread(path: Path, begin: bytes) -> None:
+    for first, what, remedy in NOT_READ:
+        if re.match(first, begin):
+            raise TableError(f"{path}: it is {what}, which is not read; {remedy}")
 
 
 def format_of(path: Path, begin: bytes) -> Format:

@@ -112,12 +112,15 @@ class Signer:
 
 
 def load_public_key(path: Path) -> Ed25519PublicKey:
-    """Read an Ed25519 public key from a PEM file. Raises KeyFileError."""
+    """Read an Ed25519 public key from a PEM file, the only one in it. Raises KeyFileError."""
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
     from cryptography.hazmat.primitives.serialization import load_pem_public_key
 
+    data = read_key_file(path)
+    if (keys := data.count(b"-----BEGIN ")) > 1:
+        raise KeyFileError(f"{path}: {keys} keys, of which one would be taken; write each into a file of its own")
     try:
-        key = load_pem_public_key(read_key_file(path))
+        key = load_pem_public_key(data)
     except ValueError:
         raise KeyFileError(f"{path}: not a public key in PEM") from None
     if not isinstance(key, Ed25519PublicKey):

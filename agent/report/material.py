@@ -12,6 +12,7 @@ import numpy as np
 
 from agent.calibrate.origin import SourceFile, source_file
 from agent.config.files import read_file
+from agent.config.strict_json import strict
 from agent.core.events import CalibrationUpdate, StatusChange, WindowReport
 from agent.core.memory import Memory
 from agent.core.outcome import with_budget
@@ -103,14 +104,16 @@ def _from_results(paths: Sequence[Path], sensor: str | None) -> Material:
 
 def _read_result(path: Path) -> CalibrationResult:
     try:
-        fields = msgspec.json.decode(read_file(path, LARGEST_RESULT), type=dict[str, Any])
+        fields = strict(read_file(path, LARGEST_RESULT))
+        if not isinstance(fields, dict):
+            raise ValueError(f"Expected `object`, got `{type(fields).__name__}`")
         return parse(fields, path.stem)
     except OSError as error:
         raise MaterialError(f"{path}: {error.strerror or error}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise MaterialError(f"{path}: the file is not a JSON object with a calibration: {error}") from None
     except ResultError as error:
         raise MaterialError(f"{path}: {error}") from None
+    except ValueError as error:
+        raise MaterialError(f"{path}: the file is not a JSON object with a calibration: {error}") from None
 
 
 def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:

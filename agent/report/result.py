@@ -13,6 +13,7 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from agent.calibrate.origin import SourceFile
+from agent.config.earlier import LARGEST_VALUE
 from agent.core.events import CalibrationUpdate
 from calib.estimate.axes import axis_warnings
 from calib.model import PARAMETERS, Array
@@ -22,6 +23,7 @@ Item = TypeVar("Item")
 Row = tuple[float | None, float | None, float | None]
 Matrix = tuple[Row, Row, Row]
 
+ROUNDED = 1e-6  # relative: results are written with all their digits
 PLACES = {"sensitivity": (3, 3), "offset": (3,)}
 # Members with their own place in the report. All further members of the object are shown in one more table.
 SHOWN = frozenset(
@@ -161,14 +163,17 @@ def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
         )
     )
     stated = fields.get("expanded_uncertainty") or {}
+    factor = _array(stated.get("coverage_factor"), (12,), "expanded_uncertainty.coverage_factor")
+    covariance = _array(fields.get("covariance"), (12, 12), "covariance")
+    _check_uncertainties(values, u, expanded, factor, covariance)
     method = fields.get("method")
     return CalibrationResult(
         label=f"Method {method}" if method else name,
         values=values,
         standard_uncertainty=u,
         expanded_uncertainty=expanded,
-        coverage_factor=_array(stated.get("coverage_factor"), (12,), "expanded_uncertainty.coverage_factor"),
-        covariance=_array(fields.get("covariance"), (12, 12), "covariance"),
+        coverage_factor=factor,
+        covariance=covariance,
         determined=np.append(*_parts(fields.get("determined"), "determined.")) == 1.0,
         degrees_of_freedom=_freedom(fields.get("degrees_of_freedom")),
         lag_s=np.nan_to_num(_array(fields.get("lag_s"), (3,), "lag_s")),
@@ -181,6 +186,26 @@ def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
         frequencies=_frequencies(fields),
         fields=fields,
     )
+
+
+def _check_uncertainties(values: Array, u: Array, expanded: Array, factor: Array, covariance: Array) -> None:
+    """Raises ResultError where u, U, their ratio and the covariance, as far as known, do not belong together."""
+    if np.nanmax(np.abs(np.concatenate([values, u, covariance.ravel()])), initial=0.0) > LARGEST_VALUE:
+        raise ResultError(f"a value is larger than {LARGEST_VALUE:g}")
+    for name, stated in (("standard_uncertainty", u), ("expanded_uncertainty", expanded)):
+        if (stated < 0.0).any():
+            raise ResultError(f"field {name}: {np.nanmin(stated):g} is negative")
+    for name, stated, expected in (
+        ("expanded_uncertainty", expanded, factor * u),
+        ("covariance", np.diag(covariance), u**2),
+    ):
+        apart = ~np.isclose(stated, expected, rtol=ROUNDED, atol=0.0)
+        if (wrong := np.flatnonzero(apart & ~np.isnan(stated) & ~np.isnan(expected))).size:
+            k = int(wrong[0])
+            raise ResultError(
+                f"field {name}: {stated[k]:g} for {PARAMETERS[k]}, where standard_uncertainty and coverage_factor give "
+                f"{expected[k]:g}; do not edit a result"
+            )
 
 
 def from_update(
@@ -273,9 +298,9 @@ def _parts(part: Any, where: str) -> tuple[Array, Array]:
 def _array(value: Any, shape: tuple[int, ...], where: str) -> Array:
     """Numbers as an array of this shape. A single number fills the array, null becomes NaN. Raises ResultError."""
     try:
-        array = np.array(np.nan if value is None else value, dtype=object)
-        array = np.where(array == None, np.nan, array).astype(float)  # noqa: E711 - elementwise
-        if array.shape not in (shape, ()):
+        given = np.array(np.nan if value is None else value, dtype=object)
+        array = np.where(given == None, np.nan, given).astype(float)  # noqa: E711 - elementwise
+        if array.shape not in (shape, ()) or any(isinstance(text, str) for text in given.ravel()):
             raise ValueError
     except (TypeError, ValueError, OverflowError):
         size = " x ".join(str(n) for n in shape)

@@ -19,9 +19,9 @@ from calib.recorded.causes import causes, silent_channels
 from calib.recorded.errors import InputError, OptionError
 from calib.recorded.options import Coupling, Options
 from calib.recorded.outcome import Outcome, nothing_used
-from calib.recorded.poses import PoseInterval, Poses, PoseSettings, beside_reference, intervals_of
+from calib.recorded.poses import PoseInterval, Poses, PoseSettings, beside_reference, intervals_of, states_gravity
 from calib.recorded.priors import contradictions, instrument_of, priors_of
-from calib.recorded.table import ReferenceTable, SensorTable, ends_s
+from calib.recorded.table import ReferenceTable, SensorTable, check_step, ends_s
 from calib.recorded.tables import Making, Tables
 from calib.recorded.wrong_unit import (
     check_gravity,
@@ -41,6 +41,9 @@ COVERAGE_FACTOR = 2.0  # of plain Method 3, as in the paper: there are thousands
 
 def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Poses | None, options: Options) -> Outcome:
     """The outcome for these samples, poses and options, which passed `options.check`. Raises InputError."""
+    if reference is not None:
+        check_step(sensor)
+        check_step(reference)
     outcome = _estimated(sensor, reference, poses, options)
     more = {**outcome.more, "reference_quantity": None if reference is None else reference.quantity}
     outcome = replace(outcome, unit=sensor.unit, more=more)
@@ -59,8 +62,8 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
         told.append(CORNERS_ALIKE)
     if setting.reference_coupling == "dc":
         told += gravity_warnings(reference)
-    elif options.reference_coupling is None:
-        told += unconfirmed_unit(reference)
+    if poses is None or not states_gravity(poses) or options.coupling == "ac":
+        told += unconfirmed_unit(reference, setting.reference_coupling)
     return replace(outcome, warnings=tuple(told))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import Any, Protocol, TypeVar
 
 from calib.recorded.errors import InputError
@@ -27,9 +28,10 @@ _AXIS = re.compile(r"(?:a|v|s|acc|accel|acceleration|accelerometer)?([xyz])")
 AXES = ("x", "y", "z")
 # Columns of a seismometer: E, N, Z, or with the codes of band and instrument before (SEED), as HNE.
 _COMPASS = {
-    "x": re.compile(r"e|east|[a-z][hlng]e"), "y": re.compile(r"n|north|[a-z][hlng]n"),
-    "z": re.compile(r"z|u|up|vertical|[a-z][hlng]z"),
+    "x": re.compile(r"e|ew|we|east|[a-z][hlng]e"), "y": re.compile(r"n|ns|sn|north|[a-z][hlng]n"),
+    "z": re.compile(r"z|u|ud|up|vert|vertical|[a-z][hlng]z"),
 }  # fmt: skip
+_ENDS = ("ew", "we", "ns", "sn", "ud")  # of a line, where they are two words: N-S
 Result = TypeVar("Result")
 
 
@@ -131,6 +133,10 @@ class Choice:
         )  # fmt: skip
         return InputError(f"{what} in the header {seen + more!r}", remedy, place=self.place)
 
+    def unknown(self, unit: str, column: str) -> InputError:
+        """An error that says which units are known."""
+        return self.fault(f"unit {unit!r} of column {column!r} is not known; known are {', '.join(UNITS)}")
+
     @property
     def place(self) -> str:
         """Where the columns are named, for messages."""
@@ -157,7 +163,7 @@ class Choice:
                 groups = ", ".join(repr(c.group) for c in found)
                 raise self.fault(f"column {candidate!r} is in several groups ({groups}), add group=NAME")
             if found and unit and unit_of(unit) is None:
-                raise self.fault(f"unit {unit!r} of column {candidate!r} is not known; known are {', '.join(UNITS)}")
+                raise self.unknown(unit, candidate)
             if found:
                 return ChosenColumn(found[0], unit or _unit(found[0]))
         raise self.fault(f"there is no column {name!r}")
@@ -197,10 +203,7 @@ class Choice:
         where others are called x and y."""
         if any(_role(c) in ("x", "y") for c in self._columns):
             return {}
-        found = {
-            axis: [c for c in self._columns if way.fullmatch((words(split(c.name)[0]) or [""])[-1])]
-            for axis, way in _COMPASS.items()
-        }
+        found = {axis: [c for c in self._columns if way.fullmatch(_way(c))] for axis, way in _COMPASS.items()}
         return {axis: of[0] for axis, of in found.items()} if all(len(of) == 1 for of in found.values()) else {}
 
     def rest(self, taken: Sequence[ChosenColumn]) -> list[ChosenColumn]:
@@ -211,6 +214,14 @@ class Choice:
             ChosenColumn(c, _unit(c)) for c in self._columns
             if c not in columns and _role(c) not in ("time", "temperature") and (not group or c.group in group)
         ]  # fmt: skip
+
+    def in_their_order(self, three: Sequence[ChosenColumn]) -> Sequence[ChosenColumn]:
+        """The three columns as x, y and z. Raises InputError where their names tell another order."""
+        told = [_way(c.column) for c in three]
+        if _in_another_order(told) or any(map(_COMPASS["z"].fullmatch, told[:2])):
+            names = ", ".join(repr(str(c.column)) for c in three)
+            raise self.fault(f"the names {names} tell another order than x, y, z")
+        return three
 
     def say(self, found: Mapping[str, ChosenColumn]) -> None:
         """Keep for the user what was guessed."""
@@ -230,6 +241,19 @@ def quantity_of(chosen: ChosenColumn) -> str | None:
 
 def _unit(column: Column) -> str:
     return column.unit or split(column.name)[1]
+
+
+def _in_another_order(told: Sequence[str]) -> bool:
+    """Whether three numbers, or three letters that follow each other in the alphabet, do not increase."""
+    if all(word.isdigit() for word in told):
+        return [int(word) for word in told] != sorted(map(int, told))
+    return "".join(sorted(told)) in ascii_lowercase and list(told) != sorted(told)
+
+
+def _way(column: Column) -> str:
+    """The word of a column's name that tells its direction or its number: the last one."""
+    told = words(split(column.name)[0]) or [""]
+    return ends if (ends := "".join(told[-2:])) in _ENDS else told[-1]
 
 
 def words(name: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from calib.recorded.choice import AXES, Choice, ChosenColumn, quantity_of
 from calib.recorded.errors import InputError
 from calib.recorded.table import REFERENCES, SENSOR
-from calib.recorded.units import Sensitivity, unit_of
+from calib.recorded.units import Sensitivity, unit_of, unknown_unit
 
 TEMPERATURE = "temperature_degc"
 ELECTRICAL = ("indication", "count")
@@ -39,7 +39,7 @@ def _with_unnamed(choice: Choice, known: dict[str, ChosenColumn]) -> dict[str, C
     """The same with the columns beside the time, or with all, where only their order tells what they are."""
     rest = choice.rest(list(known.values()))
     if list(known) == ["time"] and len(rest) == len(AXES):
-        return known | dict(zip(AXES, rest, strict=True))
+        return known | dict(zip(AXES, choice.in_their_order(rest), strict=True))
     if not known and len(rest) == 4 and all(c.column.name.isdigit() for c in rest):
         return dict(zip(("time", *AXES), rest, strict=True))
     return known
@@ -79,7 +79,8 @@ def _channels(choice: Choice, time: ChosenColumn | None) -> tuple[str | None, li
     if one:
         return one[0][0], [column for _, column in one] if not three else []
     three = three or [column for axis in AXES if (column := choice.guessed(axis))]
-    return None, three or (choice.rest([time]) if time else [])
+    rest = choice.rest([time]) if time and not three else []
+    return None, three or list(choice.in_their_order(rest) if len(rest) == len(AXES) else rest)
 
 
 def _is_electrical(chosen: ChosenColumn) -> bool:
@@ -100,6 +101,8 @@ def si_of(choice: Choice, chosen: ChosenColumn, sensitivity: Sensitivity | None)
                 f"column {str(chosen.column)!r} is in {chosen.unit}, and its sensitivity is not stated",
                 "state it as its certificate does: `sensitivity` '100 mV/g'", place=choice.place,
             )  # fmt: skip
+        if unit is None and (unknown := unknown_unit(chosen.column.name, chosen.unit)):
+            raise choice.unknown(unknown, str(chosen.column))
         return 1.0 if unit is None else unit.si
     if unit is not None and unit.quantity not in ELECTRICAL:
         raise choice.fault(f"column {str(chosen.column)!r} is in {chosen.unit} already; remove `sensitivity`")

@@ -97,6 +97,11 @@ class Poses:
         return InputError(problem, "correct the times", place=self.place, row=row, column=column, value=value)
 
 
+def states_gravity(poses: Poses) -> bool:
+    """Whether the poses say how gravity lies in the sensor's frame: so it tells S, whatever the reference says."""
+    return any(name in row.values for row in poses.rows for name in (CLAMP[0], GRAVITY[0]))
+
+
 def intervals_of(poses: Poses, setting: PoseSettings) -> list[PoseInterval]:
     """The poses in this setting. Raises InputError."""
     intervals = []

@@ -61,10 +61,12 @@ class TableStream:
         are no samples."""
         edges = np.ceil(self.clock.index_of(np.array([start_s, stop_s])))
         first, stop = (int(edge) for edge in np.clip(edges, 0, self._count))
-        ends = [*self._rows.tolist(), len(self._values)]
+        low, high = np.searchsorted(self._numbers, [first, stop]).tolist()
+        runs = slice(max(low - 1, 0), high)  # the others are outside
+        ends = np.append(self._rows, len(self._values))[runs.start : high + 1].tolist()
         parts = [
             (max(first, number), min(stop, number + next_row - row), row - number)
-            for (row, next_row), number in zip(itertools.pairwise(ends), self._numbers.tolist(), strict=True)
+            for (row, next_row), number in zip(itertools.pairwise(ends), self._numbers[runs].tolist(), strict=True)
             if max(first, number) < min(stop, number + next_row - row)
         ]
         if not parts:

@@ -27,6 +27,7 @@ ROWS_AT_ONCE = 1 << 20
 FEWEST_ROWS = 2
 FIRST_DATE_S = 1e8  # three years after 1970; no recording that counts from its begin is so long
 LAST_S = 1e11  # in the year 5138; a later time is in another unit
+MOST_STEP_S = 10.0  # usual step of times beside a reference; samples that are farther apart show no motion
 # From these values on, a time without unit counts since 1970, in this part of a second: 1e9 s is the year 2001.
 SINCE_1970 = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 
@@ -106,6 +107,16 @@ def make_whole(rows: Array, columns: Sequence[str], place: str, first: int = 0) 
     rows[np.isnan(rows[:, 1:4]).any(axis=1), 1:4] = np.nan
 
 
+def check_step(table: SensorTable | ReferenceTable) -> None:
+    """Raises InputError where samples that are to show a motion are more than MOST_STEP_S apart."""
+    usual_s = float(np.median(np.diff(table.time_s[:ROWS_AT_ONCE])))
+    if usual_s > MOST_STEP_S:
+        raise InputError(
+            f"the times are {usual_s:.4g} s apart, at most {MOST_STEP_S:g} s beside a reference",
+            "if they are in ms or in us, state their unit, or convert them to s", place=table.name, value=usual_s,
+        )  # fmt: skip
+
+
 def check_count(whole: int, place: str) -> None:
     """Raises InputError if there are fewer rows with values than two."""
     if whole < FEWEST_ROWS:
@@ -123,6 +134,17 @@ def _most_late_s(time_s: Slices) -> float:
         return 0.0 if kind_of(np.asarray(time_s[:ROWS_AT_ONCE])) == "grid" else LATEST_STAMP_S
     except ValueError:
         return 0.0
+
+
+def _digits(time_s: float) -> str:
+    return f"{time_s:.{10 if abs(time_s) < FIRST_DATE_S else 16}g}"
+
+
+def _in_order(time_s: float, before_s: float) -> str:
+    """What to do where a time follows a later one. Sorting would spoil ms that are written without leading zeros."""
+    remedy = "time must not decrease, sort or cut the samples"
+    within = math.floor(time_s) == math.floor(before_s)
+    return remedy + "; where 5 ms are written as .5, do not sort, but write .005" * within
 
 
 def check_time(time_s: Slices, column: str, place: str) -> None:
@@ -148,7 +170,7 @@ def check_time(time_s: Slices, column: str, place: str) -> None:
         if len(wrong):
             at = int(wrong[0])
             raise InputError(
-                f"{part[at]:.10g} after {before[at]:.10g}", "time must not decrease, sort or cut the samples",
+                f"{_digits(part[at])} after {_digits(before[at])}", _in_order(part[at], before[at]),
                 place=place, row=first + at, column=column, value=float(part[at]),
             )  # fmt: skip
     if not newest > ends[0]:

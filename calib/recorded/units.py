@@ -26,13 +26,15 @@ _SPELLINGS = {
     ("time", 60.0): "min mins minutes",
     ("time", 3600.0): "h hr hrs hour hours",
     ("time", 86400.0): "day days",
-    ("acceleration", 1.0): "m/s2 m/s^2 m/s**2 m/s/s mps2 ms-2 ms^-2 m·s-2 m.s-2 m*s^-2",
+    ("acceleration", 1.0): "m/s2 m/s^2 m/s**2 m/s/s mps2 ms-2 ms^-2 m·s-2 m.s-2 m*s^-2 m/sec2 m/sec^2",
     ("acceleration", 1e-2): "cm/s2 cm/s^2 gal",
     ("acceleration", 1e-3): "mm/s2 mm/s^2",
     ("acceleration", 1e-5): "mgal",
     ("acceleration", 1e-6): "µm/s2 um/s2 µm/s^2 um/s^2",
     ("acceleration", 1e-9): "nm/s2 nm/s^2",
-    ("acceleration", STANDARD_GRAVITY_MPS2): "g gn g0 g_n grav",
+    ("acceleration", 0.3048): "ft/s2 ft/s^2",
+    ("acceleration", 0.0254): "in/s2 in/s^2",
+    ("acceleration", STANDARD_GRAVITY_MPS2): "g gn g0 g_n grav g's",
     ("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2): "mg milli-g millig mgn",
     ("acceleration", 1e-6 * STANDARD_GRAVITY_MPS2): "µg ug",
     ("velocity", 1.0): "m/s mps",
@@ -51,6 +53,7 @@ _SPELLINGS = {
     ("temperature", 1.0): "degC °c c celsius deg_c",
 }
 UNITS = {name.lower(): Unit(*key, names.split()[0]) for key, names in _SPELLINGS.items() for name in names.split()}
+SI_NAMES = {quantity: names.split()[0] for (quantity, si), names in _SPELLINGS.items() if si == 1.0}
 # After "_" in a name these are units, not parts of the name: time_ms, ax_g.
 SUFFIXES = frozenset(
     [
@@ -76,11 +79,16 @@ SUFFIXES = frozenset(
     ]
 )
 _ALSO = {"ms2": "m/s2"}
+_PLAIN = str.maketrans("²⁻−⋅\u03bc", "2--·µ", " ")
+# What stands in brackets behind a name, or below it, and is no unit: a channel, an axis, how a value was made, a word.
+_NO_UNIT = re.compile(
+    r"[^a-z%]*|[xyz]|(?:ch|channel|sn|no|nr|ref)\b.*|smp|avg|min|max|std|tot|cal|uncal|no unit|unitless|[a-z]{7,}"
+)
 
 
 def unit_of(text: str) -> Unit | None:
     """The unit that `text` names, None where it names none that is known."""
-    plain = text.strip().strip("[]()").strip().lower().replace("²", "2").replace("\u03bc", "µ").replace(" ", "")
+    plain = text.strip().strip("[]()").strip().lower().translate(_PLAIN)
     return UNITS.get(_ALSO.get(plain, plain))
 
 
@@ -101,6 +109,13 @@ def split(name: str) -> tuple[str, str]:
     if (found := _SUFFIX.fullmatch(name)) and found["unit"].lower() in SUFFIXES:
         return found["base"], found["unit"]
     return name, ""
+
+
+def unknown_unit(name: str, unit: str) -> str:
+    """What stands in the place of a unit of a column, and is none that is known; else ""."""
+    found = _BRACKETS.fullmatch(name)
+    told = unit or (found["unit"] if found else "")
+    return "" if unit_of(told) or _NO_UNIT.fullmatch(told.strip("[]() ").lower()) else told
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,9 @@ import numpy as np
 from calib.geometry import STANDARD_GRAVITY_MPS2
 from calib.model import Array, Slices
 from calib.recorded.errors import UnitError
-from calib.recorded.table import ReferenceTable, SensorTable
+from calib.recorded.options import Coupling
+from calib.recorded.table import REFERENCES, ReferenceTable, SensorTable
+from calib.recorded.units import SI_NAMES
 
 # How large gravity is in units that are taken for m/s2.
 GRAVITY_IN = {"g": 1.0, "mg": 1000.0, "cm/s2": 100 * STANDARD_GRAVITY_MPS2, "mm/s2": 1000 * STANDARD_GRAVITY_MPS2}
@@ -21,6 +23,7 @@ NOT_FELT_MPS2 = 1.0  # largest mean of a reference that does not feel gravity: o
 MEANS_OF = (1, 8, 64, 512)  # samples
 FEWEST = 10  # means that tell how they scatter
 STEADY = 0.2  # quartiles of their magnitudes, relative; 0.6 of noise around zero
+SHORT = frozenset(names[0] for names in REFERENCES if len(names) == 1)  # names of this program, which state the unit
 ROWS = 100_000  # spread over the file
 ROWS_AT_ONCE = 1000  # of them
 
@@ -62,14 +65,15 @@ def gravity_warnings(reference: ReferenceTable) -> list[str]:
     ]
 
 
-def unconfirmed_unit(reference: ReferenceTable) -> list[str]:
-    """A sentence where neither gravity nor anybody tells the unit of a tri-axial reference of accelerations."""
-    if reference.channels != 3 or reference.quantity != "acceleration" or reference.unit_stated:
+def unconfirmed_unit(reference: ReferenceTable, coupling: Coupling) -> list[str]:
+    """A sentence where neither gravity in a reference nor anybody tells its unit. Columns a, v, d are in SI units."""
+    if reference.unit_stated or (reference.channels == 1 and reference.column in SHORT) or measures_gravity(reference):
         return []
-    return [
-        "the reference feels no gravity, and nobody stated its unit: it is taken as AC-coupled, and in m/s2; state the "
-        "unit after the names of its columns"
-    ]
+    taken = f"in {SI_NAMES[reference.quantity]}; state the unit after the names of its columns"
+    if reference.channels == 1:
+        return [f"nobody stated the unit of the reference: it is taken {taken}"]
+    ac = "as AC-coupled, and " if coupling == "ac" else ""
+    return [f"the reference feels no gravity, and nobody stated its unit: it is taken {ac}{taken}"]
 
 
 def measures_gravity(reference: ReferenceTable) -> bool:
@@ -88,10 +92,11 @@ def measures_gravity(reference: ReferenceTable) -> bool:
 
 def may_feel_gravity(sensor: SensorTable, reference: ReferenceTable) -> bool:
     """Whether the sensor's mean may be gravity: it is large, where outputs and reference are compared by how they move.
-    An offset of half the supply is as large."""
+    An offset of half the supply is as large. Beside a reference whose unit nobody stated it may be gravity in g."""
     V, x = _some_rows(sensor.v), _some_rows(reference.x)
     moved = float(np.sqrt(np.var(V, axis=0).sum()))
-    return float(np.linalg.norm(V.mean(axis=0)) * np.sqrt(np.var(x, axis=0).sum())) >= NOT_FELT_MPS2 * moved
+    least = NOT_FELT_MPS2 if reference.unit_stated else NOT_FELT_MPS2 / STANDARD_GRAVITY_MPS2
+    return float(np.linalg.norm(V.mean(axis=0)) * np.sqrt(np.var(x, axis=0).sum())) >= least * moved
 
 
 def _some_rows(samples: Slices) -> Array:

@@ -16,7 +16,8 @@ from agent.config.tls import TlsFiles, tls_faults
 from agent.delivery.router import open_router
 from agent.delivery.session import EndpointError, session_config
 from agent.keys.files import read_signing_key
-from agent.recording.signing import Signer
+from agent.recording.signing import Signer, load_public_key
+from tests.attacks.chain_site import KEY, public_pem
 
 
 @pytest.fixture(scope="module")
@@ -88,3 +89,14 @@ def test_only_the_owner_may_have_rights_on_a_private_key(site: Path, name: str, 
         target.rename(key)
     finally:
         key.chmod(0o600)
+
+
+def test_a_file_with_two_public_keys_is_refused_whichever_is_the_first(tmp_path: Path) -> None:
+    both = [public_pem(KEY), public_pem(Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33))))]
+    for pems in (both, both[::-1]):
+        path = tmp_path / "gateway.pub"
+        path.write_bytes(b"".join(pems))
+        with pytest.raises(KeyFileError, match="2 keys, of which one would be taken"):
+            load_public_key(path)
+    path.write_bytes(both[0])
+    assert load_public_key(path).public_bytes_raw() == KEY.public_key().public_bytes_raw()

@@ -195,7 +195,7 @@ def test_three_axes_in_g(tmp_path: Path) -> None:
         ("time_s;vx;vy;vz\n" + table(";", ",").replace("\n1,2", "\n1.000,2", 1), "line .*, column time_s: '1.000,2"),
         (HEADER + table() + "2024-13-45T00:00:00,1,2,3\n", "line 402, column time_s: '2024-13-45T00:00:00' is not"),
         ("only words\nand more words\n", "line 1: column time_s, vx, vy, vz is missing"),
-        (b"PK\x03\x04\0\0\0", "line 1: the file is not text"),
+        (b"PK\x03\x04\0\0\0", "it is a compressed file, which is not read; unpack it"),
         (HEADER + "0,1,2," + "3" * (1 << 24) + "\n", "line 2: the line is longer|line 1: the line is longer"),
     ],
 )  # fmt: skip

@@ -84,7 +84,10 @@ def test_null_is_not_determined() -> None:
         ({"sensitivity": [[1.0, 2.0], [3.0, 4.0]]}, r"field sensitivity: must be 3 x 3 numbers.*\[\[1.0, 2.0\]"),
         ({"offset": ["a", 1, 2]}, "field offset: must be 3 numbers"),
         ({"covariance": [[1.0] * 12] * 11}, "field covariance: must be 12 x 12"),
-        ({"standard_uncertainty": {"offset": 7}}, None),  # one number stands for all three
+        (
+            {"standard_uncertainty": {"offset": 7}, "expanded_uncertainty": None, "covariance": None},
+            None,
+        ),  # for all three
         ({"windows": [{"start_s": 1.0}]}, "field windows: .*stop_s"),
         ({"windows": 3}, "field windows"),
         ({"files": [{"path": 3}]}, "field files"),

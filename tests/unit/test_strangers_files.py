@@ -1,0 +1,188 @@
+"""Files whose units, columns or times could be taken for others: read right, or refused; never another S in silence."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agent.calibrate.tables import read_reference, read_sensor
+from agent.cli.main import run_cli
+from agent.reading.source import TableError
+from calib.geometry import STANDARD_GRAVITY_MPS2 as G
+
+S = np.array([[102.3, 1.1, -0.7], [-0.9, 98.4, 0.6], [0.5, -1.3, 95.1]])
+RATE_HZ, STAY_S = 100.0, 15.0
+ROTATION = ("--rotation", "1,0,0,0,1,0,0,0,1")
+
+
+def motion(t: np.ndarray, seed: int) -> np.ndarray:
+    """Accelerations (n,) in m/s2 of 15 sines."""
+    random = np.random.default_rng(seed)
+    frequency_hz, phase = random.uniform(1.0, 8.0, 15), random.uniform(0.0, 6.0, 15)
+    return np.asarray(0.5 * np.sin(2.0 * np.pi * frequency_hz * t[:, None] + phase).sum(axis=1))
+
+
+def written(path: Path, header: str, t: np.ndarray, values: np.ndarray) -> Path:
+    with path.open("w") as file:
+        file.write(header + "\n")
+        np.savetxt(file, np.column_stack([t, values]), fmt="%.7g", delimiter=",")
+    return path
+
+
+def along_each_axis(folder: Path, header: str, unit: float) -> list[str]:
+    """Options for a sensor that was moved along x, y and z, and a reference of one axis. Gravity is not stated."""
+    t = np.arange(0.0, 3.0 * STAY_S, 1.0 / RATE_HZ)
+    along, axis = motion(t, 1), np.minimum(t // STAY_S, 2.0).astype(int)
+    random = np.random.default_rng(2)
+    v = (along[:, None] * np.eye(3)[axis]) @ S.T + random.normal(0.0, 0.5, (len(t), 3))
+    sensor = written(folder / "sensor.csv", "time_s,vx,vy,vz", t, v)
+    reference = written(folder / "reference.csv", header, t, along / unit)
+    stays = [(k * STAY_S + 0.5, (k + 1) * STAY_S - 0.5, *np.eye(3)[k]) for k in range(3)]
+    poses = folder / "poses.csv"
+    poses.write_text(
+        "start_s,stop_s,dx,dy,dz\n" + "".join(",".join(f"{value:g}" for value in row) + "\n" for row in stays)
+    )
+    return ["--sensor", str(sensor), "--reference", str(reference), "--poses", str(poses)]
+
+
+Calibrate = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def calibrate(capsys: pytest.CaptureFixture[str]) -> Calibrate:
+    """Gives the exit status, and what is printed on standard output, or on standard error where nothing is."""
+
+    def run(*options: str) -> tuple[int, str]:
+        status = run_cli(["calibrate", *options, "--json", "-"])
+        out, err = capsys.readouterr()
+        return status, out or err
+
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("header", "unit", "warned"),
+    [
+        ("time_s,a", 1.0, False),
+        ("Time (s),Acc (ft/s2)", 0.3048, False),
+        ("Time (s),Acc (in/s^2)", 0.0254, False),
+        ("Time (s),Acc (G's)", G, False),
+        ("Time (s),Acc (m·s⁻²)", 1.0, False),
+        ("Time (s),Acc", 1.0, True),
+    ],
+)
+def test_a_reference_of_one_axis(header: str, unit: float, warned: bool, tmp_path: Path, calibrate: Calibrate) -> None:
+    status, told = calibrate(*along_each_axis(tmp_path, header, unit))
+    assert status == 0, told
+    found = json.loads(told)
+    np.testing.assert_allclose(found["sensitivity"], S, atol=0.4)
+    assert [w for w in found["warnings"] if "nobody stated the unit of the reference" in w] == found["warnings"]
+    assert bool(found["warnings"]) == warned
+
+
+@pytest.mark.parametrize("unit", ["EU", "%g", "g rms", "g pk", "ips2", "dB", "gRMS"])
+def test_a_unit_of_a_reference_that_is_not_known(unit: str, tmp_path: Path) -> None:
+    for header in (f"Time (s),Acc ({unit})", f"Time,Acc\ns,{unit}", f"Time,Acc [{unit}]"):
+        path = written(tmp_path / "r.csv", header, np.arange(9.0), np.ones(9))
+        with pytest.raises(TableError, match=r"line 1: unit .* of column .* is not known|expected exactly one"):
+            read_reference(path)
+
+
+@pytest.mark.parametrize("name", ["Acc (1)", "Acc (Ch 2)", "Acc (filtered)", "Acc (x)", "Acc [SN 1234]"])
+def test_brackets_without_a_unit(name: str, tmp_path: Path) -> None:
+    found = read_reference(written(tmp_path / "r.csv", f"Time,{name}", np.arange(9.0), np.ones(9)))
+    assert not found.unit_stated
+    assert found.x[:1].tolist() == [[1.0]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1.0, G])
+def test_a_reference_without_gravity_and_without_unit(unit: float, tmp_path: Path, calibrate: Calibrate) -> None:
+    t = np.arange(0.0, 30.0, 1.0 / RATE_HZ)
+    a = np.column_stack([motion(t, seed) for seed in (1, 2, 3)])
+    v = (a + np.array([0.0, 0.0, 9.81])) @ S.T + np.random.default_rng(2).normal(0.0, 0.5, a.shape)
+    options = ("--sensor", str(written(tmp_path / "s.csv", "time_s,vx,vy,vz", t, v)), "--reference",
+               str(written(tmp_path / "r.csv", "Time,X,Y,Z", t, a / unit)), *ROTATION)  # fmt: skip
+    status, told = calibrate(*options)
+    assert status == 0, told
+    found = json.loads(told)
+    assert found["offset"] == [None] * 3  # gravity would be in it
+    assert any("nobody stated its unit" in w for w in found["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("names", "read"),
+    [
+        ("Ch1,Ch2,Ch3", "123"), ("AI 8,AI 9,AI 10", "123"), ("NS,EW,UD", "213"),
+        ("Acc U-D (mV),Acc N-S (mV),Acc E-W (mV)", "321"),
+        ("Longitudinal,Lateral,Vertical", "123"), ("N,E,D", "123"), ("A,B,C", "123"),
+        ("Ch3,Ch1,Ch2", ""), ("acc3,acc2,acc1", ""), ("C,A,B", ""), ("AI 10,AI 9,AI 8", ""),
+        ("Vertical,Longitudinal,Lateral", ""),
+    ],
+)  # fmt: skip
+def test_columns_whose_names_tell_an_order(names: str, read: str, tmp_path: Path) -> None:
+    values = np.tile([1.0, 2.0, 3.0], (9, 1))
+    path = written(tmp_path / "s.csv", f"Time,{names}", np.arange(9.0), values)
+    if not read:
+        for reader in (read_sensor, read_reference):
+            with pytest.raises(TableError, match=r"tell another order than x, y, z .*say which columns to use"):
+                reader(path)
+        return
+    assert "".join(f"{v:g}" for v in read_sensor(path).v[:1][0]) == read
+
+
+@pytest.mark.parametrize(
+    ("begin", "told"),
+    [
+        (b'"TOB1","CR6"\r\n"SECONDS","NANOSECONDS","RECORD"\r\n"","",""\r\n' + bytes(range(256)), "convert it to TOA5"),
+        (b"\x1f\x8b\x08\x00abc", "unpack it"), (b"PK\x03\x04s.csv", "unpack it"),
+        (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "write it as .xlsx"),
+        ("time_s,vx,vy,vz\n".encode("utf-32"), "write it in UTF-8"),
+        (b'{"t": 0, "x": 1}\n', "it is JSON"), (b'[{"t": 0}]', "it is JSON"), (b"<?xml version='1.0'?>", "it is XML"),
+    ],
+)  # fmt: skip
+def test_files_that_are_not_read(begin: bytes, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "file.csv"
+    path.write_bytes(begin)
+    with pytest.raises(TableError, match=told):
+        read_sensor(path)
+
+
+def test_empty_quoted_fields_between_blanks(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text('time_s vx vy vz\n0.0 1 2 ""\n0.1 1 2 3\n0.2 1 2 3\n')
+    assert np.isnan(read_sensor(path).v[:1]).all()
+
+
+@pytest.mark.parametrize("head", ["time_s,vz,vy,vx", '"s","V","V","V"', "Time (s),X (V),Y (V),Z (V)"])
+def test_another_head_within_the_data(head: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    rows = [f"{k / 10},1,2,3\n" for k in range(20)]
+    path.write_text("time_s,vx,vy,vz\n" + "".join(rows[:10]) + head + "\n" + "".join(rows[10:]))
+    with pytest.raises(TableError, match=r"line 12: .* has words and no value; .* cut the file here"):
+        read_sensor(path)
+
+
+def test_ms_without_leading_zeros(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text("time,x,y,z\n" + "".join(f"17000000{k // 200:02d}.{5 * (k % 200)},1,2,3\n" for k in range(400)))
+    with pytest.raises(TableError, match=r"1700000000\.1 after 1700000000\.5; .*do not sort, but write \.005"):
+        read_sensor(path)
+
+
+def test_times_in_us_in_both_files(tmp_path: Path, calibrate: Calibrate) -> None:
+    t = np.arange(0.0, 6e7, 1e4)
+    values = np.random.default_rng(3).normal(size=(len(t), 3))
+    sensor = written(tmp_path / "s.csv", "Time,X,Y,Z", t, values)
+    reference = written(tmp_path / "r.csv", "Time,ax,ay,az", t, values)
+    began = time.process_time()
+    status, told = calibrate("--sensor", str(sensor), "--reference", str(reference), *ROTATION)
+    assert status == 2
+    assert "1e+04 s apart, at most 10 s beside a reference; if they are in ms or in us, state their unit" in told
+    assert time.process_time() - began < 5.0
