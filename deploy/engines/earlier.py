@@ -83,6 +83,8 @@ REVISIONS = (
     Revision(21, "d6ede69441d7", "0.3.0"),
     # The last before the noise of a reference is that of its quietest windows, and motion ends below a gap.
     Revision(22, "6120401ea8aa", "0.3.0"),
+    # The last before a fast reference is not folded, and slow motion excites by its whole power.
+    Revision(23, "5c157bb27d11", "0.3.0"),
 )
 
 
