@@ -26,6 +26,10 @@ from calib.signal.response import FLAT, Response
 from calib.signal.samples import Samples
 from calib.windows.bands import ABOVE, HIGHEST, motion_band_hz, share_above
 
+# Share of the motion's power above the band that may stay where a response is taken out: what that makes of the rest of
+# a shock is none of the instruments, and S would be fitted to it.
+ABOVE_RESPONSE = 0.1 * ABOVE
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StretchWindows:
@@ -82,8 +86,7 @@ def windows_in(
     try:
         sensor, reference = _cut(span_s, channel, streams)
         found = made(None)
-        # Above, a response that is taken out is none of the instruments: least squares would fit S to what it makes.
-        most = ABOVE if response.is_flat else 0.0
+        most = ABOVE if response.is_flat else ABOVE_RESPONSE
         if any(share_above(window.bands, HIGHEST * to_hz) > most for window in found):
             motion_hz = motion_band_hz(found, lasting=True)
             found = [replace(window, motion_hz=motion_hz) for window in made(to_hz)]

@@ -220,9 +220,7 @@ def aligned(
     noise = not_more_than_incoherent(noise, points.own_u, points.V, sensor_rate_hz, instrument.derivatives)
     told = {name: float(count) for name, count in counts.items() if count}
     sensor_noise = np.sqrt(0.5 * sensor_rate_hz) * band_above_noise(V, sensor_rate_hz)[1]
-    return Aligned(
-        points, noise, u_noise, sensor_noise, clipped, independent, filters_to_hz, told
-    )  # fmt: skip
+    return Aligned(points, noise, u_noise, sensor_noise, clipped, independent, filters_to_hz, told)
 
 
 def _filtered(

@@ -20,6 +20,7 @@ NEAR = 0.05  # relative: offsets of a reference are not larger
 # uzh-rpg/rpg_dvs_ros issue 58 shows 0.9.
 NEAR_IN_UNIT = 0.15
 NOT_FELT_MPS2 = 1.0  # largest mean of a reference that does not feel gravity: offsets of 0.1 g
+GRAVITY_IN_G = 0.8  # or more, where a unit that nobody stated may be g
 MEANS_OF = (1, 8, 64, 512)  # samples
 FEWEST = 10  # means that tell how they scatter
 STEADY = 0.2  # quartiles of their magnitudes, relative; 0.6 of noise around zero
@@ -95,7 +96,7 @@ def may_feel_gravity(sensor: SensorTable, reference: ReferenceTable) -> bool:
     An offset of half the supply is as large. Beside a reference whose unit nobody stated it may be gravity in g."""
     V, x = _some_rows(sensor.v), _some_rows(reference.x)
     moved = float(np.sqrt(np.var(V, axis=0).sum()))
-    least = NOT_FELT_MPS2 if reference.unit_stated else NOT_FELT_MPS2 / STANDARD_GRAVITY_MPS2
+    least = NOT_FELT_MPS2 if reference.unit_stated else GRAVITY_IN_G
     return float(np.linalg.norm(V.mean(axis=0)) * np.sqrt(np.var(x, axis=0).sum())) >= least * moved
 
 
