@@ -32,7 +32,7 @@ LEVEL = 1e-6  # probability that a right figure fails a test of some of its runs
 # The module whose output a part is, where it is not the one that calls `write_part` with the name.
 ELSEWHERE = {
     "mpu9150": "agent.calibrate.printing", "imports": "docs.images.import_graph", "worked": "docs.worked_budget",
-    "worked block": "docs.worked_block",
+    "worked block": "docs.worked_block", "drawn structures": "benchmarks.online.drawn_structures",
     "transitions": "",  # a table of rules, which tests/properties/test_gate.py compares
     "site-runs": "benchmarks.site", "site-large": "benchmarks.site",
     **dict.fromkeys(("table", "known", "skirts", "inside"), "benchmarks.response"), "walks": "benchmarks.walks",
