@@ -6,7 +6,7 @@ The motions are those of towers, ships, floors, vehicles and cranes, as an engin
 tones that wander, blows and steps of people. The instruments are drawn beside them: a sensor with the filters of its
 data sheet, with a filter that nobody states, of 12 or 16 bits, at 62.5 to 500 samples a second; a reference at 100 to
 500, DC-coupled or with a stated corner, behind its own filter, with the noise of a seismometer or of a MEMS device; USB
-that is late, warm days, and windows each minute, ten minutes or draw. All other settings are the defaults.
+that is late, warm days, and windows each minute, ten minutes or hour. All other settings are the defaults.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.signal import butter, freqs
 
 from benchmarks.online.bridge import Bridge, Happens, Moved, ac
 from benchmarks.online.config import building_config
@@ -31,19 +30,18 @@ from benchmarks.online.node import adxl355
 from benchmarks.page import machine, write_part
 from calib.model import Array
 from hw.virtual.building import BuildingDevice, BuildingParameters, Weather
-from hw.virtual.building_motion import BuildingMotion, ComplexArray
+from hw.virtual.building_motion import BuildingMotion
 from hw.virtual.noise import NoiseStream
-from hw.virtual.response import Response
+from hw.virtual.response import Response, in_turn
 from hw.virtual.schedule import STANDARD_GRAVITY_MPS2, rotation
 from hw.virtual.timebase import Bursts, Clock
+from tests.pair import lowpass
 
 GRID_HZ, PAD_S = 1024.0, 15.0  # of the motion
 CORNER_HZ = 0.05  # of an AC-coupled reference, as bridge.ac has it
-CADENCES = {
-    "minute": (0.0, 150),
-    "ten minutes": (600.0, 100),
-    "hour": (3600.0, 60),
-}  # from start to start in s, windows
+# From start to start in s (0: one after the other), and how many.
+CADENCES = {"minute": (0.0, 150), "ten minutes": (600.0, 100), "hour": (3600.0, 60)}
+OWN_CORNER = 0.35  # of its rate: where the reference's own filter has its corner
 S_PER_K = 5e-5
 PRIOR = {"sensitivity": 1.0, "u_main_pct": 1.5, "u_transverse_pct": 0.75, "u_offset_mps2": 0.3}
 
@@ -160,28 +158,12 @@ class DrawnBuilding(Bridge):
         n = round((stop_s - start_s + 2.0 * PAD_S) * GRID_HZ)
         time_s = np.arange(n) / GRID_HZ - PAD_S
         hz = np.asarray(np.fft.rfftfreq(n, 1.0 / GRID_HZ), np.float64)
-        random, lasting = (
-            np.random.default_rng([self.seed, 1, visit]),
-            np.random.default_rng([self.seed, 2, visit // 4]),
-        )
-        draw = MotionDraw(time_s, hz, random, lasting, int(start_s / 3600.0) % 24)
-        found = self._moved(draw) @ self._mixed
+        alone = np.random.default_rng([self.seed, 1, visit])
+        lasting = np.random.default_rng([self.seed, 2, visit // 4])
+        found = self._moved(MotionDraw(time_s, hz, alone, lasting, int(start_s / 3600.0) % 24)) @ self._mixed
         if response is not None:
             found = np.fft.irfft(np.fft.rfft(found, axis=0) * response(hz)[:, None], n, axis=0)
         return Moved(CubicSpline(start_s + time_s, found))  # type: ignore[return-value]
-
-
-def _filter(corner_hz: float, order: int) -> Response:
-    numerator, denominator = butter(order, 2.0 * np.pi * corner_hz, analog=True)
-
-    def response(frequency_hz: Array) -> ComplexArray:
-        return np.asarray(freqs(numerator, denominator, 2.0 * np.pi * np.asarray(frequency_hz))[1])
-
-    return response
-
-
-def _both(one: Response, other: Response) -> Response:
-    return lambda frequency_hz: one(frequency_hz) * other(frequency_hz)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,10 +182,8 @@ def structure(seed: int) -> DrawnStructure:
     name = list(STRUCTURES)[seed % len(STRUCTURES)]
     coupling, cadence = str(random.choice(["DC", "DC", "AC"])), str(random.choice(list(CADENCES)))
     kind = str(random.choice(["ADXL355", "ADXL355", "12 bits", "filter", "16 bits"]))
-    rate_hz, reference_hz = (
-        float(random.choice([62.5, 125.0, 250.0, 500.0])),
-        float(random.choice([100.0, 200.0, 500.0])),
-    )
+    rate_hz = float(random.choice([62.5, 125.0, 250.0, 500.0]))
+    reference_hz = float(random.choice([100.0, 200.0, 500.0]))
     density = float(random.choice([2e-6, 2e-5, 1e-4]))
     late = (Bursts(), Bursts(0.002, 0.003, 0.002, 0.2), Bursts(0.01, 0.02, 0.01, 1.0))[random.integers(3)]
     every_s, windows = CADENCES[cadence]
@@ -234,19 +214,24 @@ def _sensor(kind: str, own: BuildingDevice, random: np.random.Generator) -> Buil
     own = replace(own, noise_mps2=noise_mps2)
     if kind == "ADXL355":
         return adxl355(own, rate_hz)
-    return replace(own, response=_filter(random.uniform(0.15, 0.3) * rate_hz, 2)) if kind == "filter" else own
+    return replace(own, response=lowpass(2, random.uniform(0.15, 0.3) * rate_hz)) if kind == "filter" else own
 
 
 def _reference(coupling: str, rate_hz: float, density: float, rate_error: float, late: Bursts) -> BuildingDevice:
-    own = _filter(0.35 * rate_hz, 6)
-    response = _both(own, ac) if coupling == "AC" else own
+    own = _own_filter(rate_hz)
+    response = in_turn(own, ac) if coupling == "AC" else own
     noise_mps2 = density * np.sqrt(0.5 * rate_hz)
     return BuildingDevice(noise_mps2, Clock(rate_hz, rate_error, 0.0004), late=late, response=response)
 
 
+def _own_filter(rate_hz: float) -> Response:
+    """The filter that a reference has beside its stated corner."""
+    return lowpass(6, OWN_CORNER * rate_hz)
+
+
 @dataclass(frozen=True, slots=True)
 class StructureLife:
-    """How a world went: the share of windows after which the status was each one, the largest error of a determined
+    """How a structure went: the share of windows after which the status was each one, the largest error of a determined
     element of S and Q in force over its u, u of the main sensitivities at the end in % (the largest; NaN where none is
     in force), and how many elements are determined."""
 
@@ -264,9 +249,10 @@ class StructureLife:
 
 
 def lived(made: DrawnStructure) -> StructureLife:
-    """Simulate a world."""
+    """Simulate a structure."""
     house, count, worst = House(made.building, building_config(made.building, **made.keys)), Counter[str](), 0.0
     gateway, p = house.gateway, made.building.parameters
+    own = _own_filter(p.reference.clock.nominal_rate_hz)
     for visit in range(made.windows):
         house.visit()
         count[gateway.status] += 1
@@ -274,7 +260,7 @@ def lived(made: DrawnStructure) -> StructureLife:
             continue
         truth = made.building.at_mean(made.building.span(visit)[1])
         hz = update.reference_frequency_hz
-        truth[:9] *= p.sensor.size(hz) / _seen(p.reference, hz)
+        truth[:9] *= p.sensor.size(hz) / abs(own(np.array([hz]))[0])  # the stated corner is undone
         error = np.abs(np.append(np.ravel(update.sensitivity), update.offset) - truth) / update.standard_uncertainty
         worst = max(worst, float(np.max(error, where=np.array(update.determined), initial=0.0)))
     u_pct, determined = np.nan, 0
@@ -283,15 +269,6 @@ def lived(made: DrawnStructure) -> StructureLife:
     return StructureLife(
         made.said, {name: n / made.windows for name, n in count.most_common()}, worst, u_pct, determined
     )
-
-
-def _seen(reference: BuildingDevice, frequency_hz: float) -> float:
-    """What a reference shows of a motion, its stated corner undone."""
-    return reference.size(frequency_hz) / (abs(ac(np.array([frequency_hz]))[0]) if _is_ac(reference) else 1.0)
-
-
-def _is_ac(reference: BuildingDevice) -> bool:
-    return reference.size(1e-6) < 0.5
 
 
 def main() -> None:

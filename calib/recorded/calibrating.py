@@ -62,9 +62,8 @@ def calibrated(sensor: SensorTable, reference: ReferenceTable | None, poses: Pos
         told.append(CORNERS_ALIKE)
     if setting.reference_coupling == "dc":
         told += gravity_warnings(reference)
-    if (poses is None or not states_gravity(poses) or options.coupling == "ac") and (
-        reference.channels == 1 or options.reference_coupling is None
-    ):
+    gravity_tells = poses is not None and states_gravity(poses) and options.coupling != "ac"
+    if not gravity_tells and (reference.channels == 1 or options.reference_coupling is None):
         told += unconfirmed_unit(reference, setting.reference_coupling)
     return replace(outcome, warnings=tuple(told))
 
