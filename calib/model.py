@@ -82,9 +82,9 @@ class BandSums:
     `reference_channels` is m, integrals included. `low_hz`, `high_hz` (B,) are the limits of the bands, `points` (B,)
     the numbers of points in them, of which the share `independent` is statistically independent. `products`
     (B, 2 m + 3, 2 m + 3) are sums over points of products of u in m/s2, du/dt in m/s3 and V in output unit. `noise`
-    (B, 2 m + 3) is the power of white noise. That of the reference was subtracted from the diagonals and is still in
-    the residuals. That of V was not; it is 0 where nothing tells it, and inf where all other noise is V's. `lasting`
-    (B,): power of the motion that is there for half of the time, over its mean power.
+    (B, 2 m + 3) is the power of white noise. Where calib.windows.excited subtracted that of the reference from the
+    products, it is still in the residuals. That of V is 0 where nothing tells it, and inf where all other noise is V's.
+    `lasting` (B,): power of the motion that is there for half of the time, over its mean power.
     """
 
     reference_channels: int

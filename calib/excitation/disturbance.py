@@ -41,13 +41,14 @@ TINY = 1e-300
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFilter:
-    """Taps (2 k + 1,) of the filter, its amplitude (F,) at frequencies (F,) from 0 to half the sampling rate, and the
-    white noise (2, m) of the reference that it leaves in u and du/dt."""
+    """Taps (2 k + 1,) of the filter, its amplitude (F,) at frequencies (F,) from 0 to half the sampling rate, the rms
+    (2, m) of the reference's noise in u and du/dt before it, and the part (2, m) of both that it leaves."""
 
     taps: Array
     frequency_hz: Array
     amplitude: Array
     reference_noise: Array
+    noise_left: Array
 
     def passed(self, columns: Array) -> Array:
         """Samples (n, k) after the filter. A mean stays what it is; rows near an end or a missing sample are NaN."""
@@ -58,6 +59,10 @@ class NoiseFilter:
         """The share of the points that stay independent after this filter and one that ends at `to_hz`."""
         power = self.amplitude[self.frequency_hz <= to_hz] ** 2
         return float(np.sum(power) ** 2 / (len(self.amplitude) * np.sum(power**2)))
+
+    def before(self, reference_noise: Array) -> Array:
+        """The reference's noise (2, m) before the filter, from that after it."""
+        return reference_noise / self.noise_left
 
     def left_in(self, bands: BandSums) -> BandSums:
         """Bands of what passed the filter, with the points that stay independent in each; those that keep too few are
@@ -72,10 +77,10 @@ class NoiseFilter:
         return parts(replace(bands, points=points, noise=noise), kept)
 
 
-def against_noise(points: Points, reference_noise: Array, *, knocked: bool) -> NoiseFilter | None:
+def against_noise(points: Points, reference_noise: Array, *, knocked: bool, derivatives: int = 0) -> NoiseFilter | None:
     """The filter for these points; None where all bands are about as noisy, or where there are too few points to tell.
-    `reference_noise` (2, m) is that of the first m channels, which count. `knocked`: many points look like knocks,
-    perhaps because of noise beside the motion."""
+    `reference_noise` (2, m) is that of the first m channels, which count, whose quantity was differentiated so often.
+    `knocked`: many points look like knocks, perhaps because of noise beside the motion."""
     channels = reference_noise.shape[1]
     u, rate_hz = points.u[:, :channels], float((len(points.u) - 1) / (points.time_s[-1] - points.time_s[0]))
     size = 2 * (len(u) // (SEGMENTS + 1))
@@ -100,7 +105,7 @@ def against_noise(points: Points, reference_noise: Array, *, knocked: bool) -> N
     weights = np.clip(np.sqrt(np.minimum(usual / noise, 1.0) * motion / (motion + noise)), LEAST_WEIGHT, 1.0)
     weights[: int(np.flatnonzero(moved)[0])] = 1.0  # slow changes of the mean are judged, not hidden
     lowest_hz = float(edges[np.flatnonzero(moved)[0]]) * rate_hz / size
-    return _filter(weights, edges, size, rate_hz, lowest_hz, len(u), reference_noise)
+    return _filter(weights, edges, size, rate_hz, lowest_hz, len(u), reference_noise, derivatives)
 
 
 def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float, derivatives: int) -> Array:
@@ -170,26 +175,27 @@ def _parted(power: Complex, other: Complex, both: Complex, count: NDArray[np.int
 
 
 def _filter(
-    weights: Array, edges: NDArray[np.int64], size: int, rate_hz: float, lowest_hz: float, samples: int, noise: Array
-) -> NoiseFilter:
+    weights: Array, edges: NDArray[np.int64], size: int, rate_hz: float, lowest_hz: float, samples: int, noise: Array,
+    derivatives: int,
+) -> NoiseFilter:  # fmt: skip
     """A filter with these weights in the bands, of linear phase around its middle tap; `noise` (2, m) before it."""
     frequency_hz = np.arange(size // 2 + 1) * rate_hz / size
     amplitude = np.concatenate([np.full(int(edges[0]), weights[0]), np.repeat(weights, np.diff(edges)), weights[-1:]])
     half = int(min(CYCLES * rate_hz / lowest_hz, MOST_LOST * samples, size // 2 - 1))
     taps = np.roll(np.fft.irfft(amplitude, size), half)[: 2 * half + 1] * hanning(2 * half + 3)[1:-1]
     passed = np.abs(np.fft.rfft(np.roll(np.pad(taps, (0, size - len(taps))), -half)))
-    return NoiseFilter(taps, frequency_hz, passed, _left_of(noise, frequency_hz, passed))
+    return NoiseFilter(taps, frequency_hz, passed, noise, _left_of(noise, frequency_hz, passed, derivatives))
 
 
-def _left_of(noise: Array, frequency_hz: Array, amplitude: Array) -> Array:
-    """(2, m) rms in u and du/dt after a filter, of noise that is white up to some frequency; `noise` (2, m) before.
-
-    The ratio of both tells this frequency.
-    """
-    out = noise.copy()
+def _left_of(noise: Array, frequency_hz: Array, amplitude: Array, derivatives: int) -> Array:
+    """(2, m) what a filter leaves of the rms of `noise` (2, m) in u and du/dt, of a quantity that was differentiated so
+    often. The ratio of both tells up to which frequency it is."""
+    out = np.ones_like(noise)
+    of_u, of_rate = 2 * derivatives + 1, 2 * derivatives + 3
     for k in np.flatnonzero(noise[0] > 0.0):
-        end_hz = np.sqrt(3.0) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
+        end_hz = np.sqrt(of_rate / of_u) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
         inside = np.maximum(1, np.searchsorted(frequency_hz, end_hz))
-        power, square = amplitude[:inside] ** 2, frequency_hz[:inside] ** 2
-        out[:, k] *= np.sqrt([power.mean(), power @ square / max(square.sum(), TINY)])
+        power, f = amplitude[:inside] ** 2, frequency_hz[:inside]
+        of_each = f ** (of_u - 1), f ** (of_rate - 1)
+        out[:, k] = np.sqrt([power @ weight / max(weight.sum(), TINY) for weight in of_each])
     return out

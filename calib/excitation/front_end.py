@@ -23,9 +23,9 @@ from calib.excitation.sustained import sustained_hz
 from calib.excitation.turning import feels_gravity, is_turned, standing_parts
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, disproportionate
 from calib.excitation.windows import CALM, Points, at_rest, motion_windows, rest_window, still_window
-from calib.model import U_NOISE, Array, BandSums, Pose, Window, WindowSums, own_channels
+from calib.model import U_NOISE, Array, Pose, Window, WindowSums, own_channels
 from calib.signal.band import band_above_noise, folds, lowpass, unfolded, without_short_holes, without_slow
-from calib.signal.corner import integral, with_integral, without_corner
+from calib.signal.corner import integral_of_motion, with_integral, without_corner
 from calib.signal.glitches import glitches
 from calib.signal.holes import Mask
 from calib.signal.instrument import Instrument
@@ -38,7 +38,7 @@ from calib.signal.resampling import (
 )
 from calib.signal.response import FLAT, Response, passed
 from calib.signal.samples import Samples
-from calib.windows.bands import TAPER, beside_noise
+from calib.windows.bands import TAPER, beside_noise, beside_reference_noise
 
 # Samples beyond a window's ends, the reference's (the sensor's half of it): half the taps of resampling, of
 # differentiating and of the low-pass filter at 100 Hz and above.
@@ -214,7 +214,7 @@ def aligned(
     points = Points(time_s[kept], V_kept, u_kept, du_kept, struck[kept] if struck.any() else None)
     if u_noise > U_NOISE and not settings.limit_band:  # Method 3 as printed
         noise = np.zeros_like(noise)
-    noise = noise if against is None else against.reference_noise
+    noise = noise if against is None else against.noise_left * against.reference_noise
     if settings.limit_band and u_noise <= U_NOISE:
         points = points._replace(most_noise=noise[0])
     noise = not_more_than_incoherent(noise, points.own_u, points.V, sensor_rate_hz, instrument.derivatives)
@@ -270,7 +270,7 @@ def _side_by_side(
     raw, V, raw_filled, filled = without_short_holes(raw, indications, (rate_hz, sensor_rate_hz))
     u, lost = differentiate(raw, rate_hz, instrument.derivatives) if instrument.derivatives else (raw, 0)
     if instrument.has_corner:
-        u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral(u, rate_hz)])
+        u = np.hstack([without_corner(u, rate_hz, instrument.corner_hz), integral_of_motion(u, rate_hz)])
         V = without_corner(V, sensor_rate_hz, instrument.sensor_corner_hz)
     u = unfolded(passed(instrument.known.passed(u, rate_hz), rate_hz, response), rate_hz, sensor_rate_hz)
     at = resample(u, reference.clock, sensor.time_s - lag_s, reference.first_index, lost)
@@ -315,12 +315,12 @@ def _rest(
     return [rest_window(pose, t, V, settings.limits, floor=floor, leave_out=settings.leave_out)]
 
 
-def _against(found: Aligned, made: Sequence[Window]) -> NoiseFilter | None:
+def _against(found: Aligned, made: Sequence[Window], derivatives: int) -> NoiseFilter | None:
     """A filter against noise of the sensor, where its windows are knocked or hardly coherent, and where one helps."""
     knocked = any(100.0 * w.left_out > KNOCKED_PCT * (w.points + w.left_out) for w in made)
     if not knocked and not any(w.numbers.get("coherence", 1.0) < COHERENT for w in made):
         return None
-    return against_noise(found.points, found.reference_noise, knocked=knocked)
+    return against_noise(found.points, found.reference_noise, knocked=knocked, derivatives=derivatives)
 
 
 def _motion(
@@ -343,7 +343,7 @@ def _motion(
         within = _motion(stands, sensor, reference, instrument, span_s, lag_s, limited, response)
         if any(window.used for window in within):
             return within
-    against = _against(found, made) if settings.limit_band else None
+    against = _against(found, made, instrument.derivatives) if settings.limit_band else None
     if against is not None and (better := align(against=against)) is not None:
         found, made = better, _beside(pose, better, settings, before=found.points)
     else:
@@ -353,11 +353,19 @@ def _motion(
     made = [replace(_slow(_with_numbers(w, found), found.points), u_lag_s=u_lag_s, response=taken) for w in made]
     # Where the noise of the reference is stated, all other noise is the sensor's.
     sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
-    return [_with_noise(w, sensor_noise, against) for w in made]
+    return [_with_noise(w, sensor_noise, instrument.derivatives, against) for w in made]
 
 
-def _with_noise(window: Window, sensor_noise: Array, against: NoiseFilter | None) -> Window:
-    return window if window.bands is None else replace(window, bands=_noisy(window.bands, sensor_noise, against))
+def _with_noise(window: Window, sensor_noise: Array, derivatives: int, against: NoiseFilter | None) -> Window:
+    """The window with the noise in its bands; `against`: the filter that they passed. The reference's noise is white in
+    a quantity that was differentiated so often."""
+    if window.bands is None:
+        return window
+    bands, noise = beside_noise(window.bands, sensor_noise), window.reference_noise
+    if noise is not None:
+        before = noise if against is None else against.before(noise)
+        bands = beside_reference_noise(bands, before, window.points + window.left_out, derivatives)
+    return replace(window, bands=bands if against is None else against.left_in(bands))
 
 
 def _beside_shocks(points: Points, made: Sequence[Window]) -> float | None:
@@ -372,12 +380,6 @@ def _beside_shocks(points: Points, made: Sequence[Window]) -> float | None:
         return None
     rate_hz = (len(points.time_s) - 1) / (points.time_s[-1] - points.time_s[0])
     return sustained_hz(points.u[:, : own_channels(points.u.shape[1])], rate_hz)
-
-
-def _noisy(bands: BandSums, sensor_noise: Array, against: NoiseFilter | None) -> BandSums:
-    """The bands with the sensor's white noise in them; `against`: the filter that they passed."""
-    bands = beside_noise(bands, sensor_noise)
-    return bands if against is None else against.left_in(bands)
 
 
 def _beside(pose: Pose, found: Aligned, settings: Settings, before: Points | None = None) -> list[Window]:

@@ -14,21 +14,60 @@ from dataclasses import replace
 import numpy as np
 
 from calib.model import Array, Pose
+from calib.signal.band import hanning
+
+BELOW = 1e-2  # of the power of motion, that is slower than where it begins
+SLOWER = 0.5  # times the frequency at which the motion begins: what is slower is noise
+CYCLES = 30  # of the slowest motion, in a stretch: with fewer, it cannot be told from what is slower
 
 
-def integral(x: Array, rate_hz: float) -> Array:
+def integral(x: Array, rate_hz: float, from_hz: float = 0.0) -> Array:
     """2 pi times the time integral of samples x (n, m) in m/s2; the result is in m/s2 s and as large as x at 1 Hz.
 
     Each stretch between missing samples (NaN) is integrated by itself; the result is NaN where samples are missing. The
     constant of integration does not matter, because a window has a constant of its own. Mean and linear trend are
-    removed: otherwise the zero error of the instrument would make the integral grow without limit.
+    removed: otherwise the zero error of the instrument would make the integral grow without limit. So is what is slower
+    than `from_hz`.
     """
     out = np.full(x.shape, np.nan)
+    for first, stop in _stretches(x):
+        out[first:stop] = _without_slower(_integral(x[first:stop], rate_hz), rate_hz, from_hz)
+    return out
+
+
+def integral_of_motion(x: Array, rate_hz: float) -> Array:
+    """The integral of samples x (n, m) of an instrument at the frequencies of its motion.
+
+    Below them it is the integral of the instrument's noise, which grows towards low frequencies. Were it a regressor,
+    the corner, by which noise and its integral go together, would be found too low.
+    """
+    longest = max(_stretches(x), key=lambda ends: ends[1] - ends[0], default=(0, 0))
+    return integral(x, rate_hz, SLOWER * _begins_hz(x[slice(*longest)], rate_hz))
+
+
+def _stretches(x: Array) -> list[tuple[int, int]]:
+    """[first, stop) of each stretch of x (n, m) without a missing sample."""
     whole = np.isfinite(x).all(axis=1)
     edges = np.flatnonzero(np.diff(whole.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    for first, stop in edges.tolist():
-        out[first:stop] = _integral(x[first:stop], rate_hz)
-    return out
+    return [(first, stop) for first, stop in edges.tolist()]
+
+
+def _begins_hz(x: Array, rate_hz: float) -> float:
+    """The frequency below which x (n, m) has less than the share BELOW of its power; 0 where that is a few cycles."""
+    if len(x) < 2:
+        return 0.0
+    power = np.sum(np.abs(np.fft.rfft((x - x.mean(axis=0)) * hanning(len(x))[:, None], axis=0)) ** 2, axis=1)
+    line = int(np.searchsorted(np.cumsum(power), BELOW * power.sum()))
+    return line * rate_hz / len(x) if line >= CYCLES else 0.0
+
+
+def _without_slower(x: Array, rate_hz: float, from_hz: float) -> Array:
+    """x (n, m) without what is slower than `from_hz`, by its cosine transform, which needs no samples beyond it."""
+    if not from_hz:
+        return x
+    lines = np.fft.rfft(np.concatenate([x, x[::-1]]), axis=0)
+    lines[: int(np.ceil(2.0 * len(x) * from_hz / rate_hz))] = 0.0
+    return np.asarray(np.fft.irfft(lines, 2 * len(x), axis=0)[: len(x)])
 
 
 def _integral(x: Array, rate_hz: float) -> Array:

@@ -68,9 +68,10 @@ class OverFrequency:
             over = replace(over, first_hz=self.first_hz or record.mean_hz)
         elif self.motion_hz is None and self.late_s is None and record.mean_hz:
             over = replace(self, first_hz=record.mean_hz, late_s=record.lag_s)
-        if over.settled_hz or not record.mean_hz or not any(one.mean_hz for one in before):
+        moving = [one.mean_hz for one in (*before, record) if one.mean_hz]
+        if over.settled_hz or not record.mean_hz or len(moving) < 2:
             return over
-        return replace(over, settled_hz=over.at_hz)
+        return replace(over, settled_hz=over._among(min(moving)))
 
     def _settled(self, records: Sequence[Record]) -> Self:
         """With the band of these windows, until they are SEVERAL."""
@@ -85,13 +86,20 @@ class OverFrequency:
 
     @property
     def at_hz(self) -> float:
-        """The frequency at which S holds where none is stated: before it is settled, the first one that moved if
-        nothing else did or if it is in the band, else the middle of the band; 0 before any motion."""
-        if self.settled_hz or self.motion_hz is None:
-            return self.settled_hz or self.first_hz
+        """The frequency at which S holds where none is stated; 0 before any motion."""
+        return self.settled_hz or self._among(self.first_hz)
+
+    def _among(self, mean_hz: float) -> float:
+        """The frequency at which S holds: the first one that moved if nothing else did or if it is in the band, else
+        the middle of the band, or the mean frequency `mean_hz` of a window where that is lower. Motion that comes and
+        goes, such as that of a lorry, reaches higher than what several windows have in common."""
+        if self.motion_hz is None:
+            return self.first_hz
         low_hz, high_hz = self.motion_hz
-        first = self.late_s is not None and low_hz <= self.first_hz <= self.to_hz
-        return self.first_hz if first else float(np.sqrt(low_hz * high_hz))
+        if self.late_s is not None and low_hz <= self.first_hz <= self.to_hz:
+            return self.first_hz
+        middle_hz = float(np.sqrt(low_hz * high_hz))
+        return mean_hz if low_hz < mean_hz < middle_hz else middle_hz
 
     def stating(self, band_hz: tuple[float, float] | None) -> Self:
         """The same where the band is stated; None: it is settled by windows."""

@@ -81,29 +81,32 @@ def banded(
 class Factors:
     """The regressions of V on u and du/dt in B bands of a window; V has A outputs, three or that along the motion.
 
-    `gram` (B, 2M, 2M) is that of [u, du/dt], `root` (B, 2M, 2M) its factor, `slopes` (B, 2M, A) = root b, `noise`
-    (B, A) their noise. `omega` (B,) in rad/s is that of the motion in the band, `middle_hz` (B,) the band's middle.
-    `told` and `left` (B, A): the power of V that the motion explains, and the rest; `white` (B, A): what white noise of
-    sensor and reference has in it. Of the `points` (B,), the rest has `free` (B,) degrees of freedom.
+    Of a reference with N own channels and their integrals M is 2 N, else N. Integrals are no regressors: in a band they
+    are the derivatives, and their own derivatives are the channels, but for what interpolation errs.
+
+    `gram` (B, 2M, 2M) is that of [u, du/dt] of the M channels, `root` (B, 2N, 2M) a factor of what of it the regressors
+    show, `slopes` (B, 2N, A) = root b, `noise` (B, A) their noise. `omega` (B,) in rad/s is that of the motion in the
+    band, `middle_hz` (B,) the band's middle. `told` and `left` (B, A): the power of V that the motion explains, and the
+    rest; `white` (B, A): what white noise of sensor and reference has in it. Of the `points` (B,), the rest has `free`
+    (B,) degrees of freedom.
     """
 
     def __init__(self, bands: BandSums, kept: NDArray[np.int64]) -> None:
         m, real, products = bands.reference_channels, own_channels(bands.reference_channels), bands.products[kept]
-        self.gram, cross = products[:, : 2 * m, : 2 * m], products[:, : 2 * m, 2 * m :]
+        own = np.r_[0:real, m : m + real]
+        self.gram = products[:, : 2 * m, : 2 * m]
         powers = np.diagonal(products, axis1=1, axis2=2)
         self.omega = np.sqrt(powers[:, m : m + real].sum(axis=1) / powers[:, :real].sum(axis=1))
         self.middle_hz = np.sqrt(bands.low_hz[kept] * bands.high_hz[kept])
-        scale = _unit(powers[:, : 2 * m])
-        values, vectors = np.linalg.eigh(self.gram / (scale[:, :, None] * scale[:, None]))
+        scale = _unit(powers[:, own])
+        values, vectors = np.linalg.eigh(self.gram[:, own[:, None], own] / (scale[:, :, None] * scale[:, None]))
         live = values > RELATED * values[:, -1:]
-        root = np.where(live, np.sqrt(np.maximum(values, 0.0)), 0.0)[..., None]
-        inverse = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0.0)
-        ways = vectors.transpose(0, 2, 1)
-        self.root = root * ways * scale[:, None]
-        self.slopes = inverse * (ways @ (cross / scale[..., None]))
-        b = (vectors @ (inverse * self.slopes)) / scale[..., None]
+        inverse = np.divide(1.0, np.sqrt(np.maximum(values, 0.0)), out=np.zeros_like(values), where=live)
+        whitened = inverse[..., None] * vectors.transpose(0, 2, 1) / scale[:, None]
+        self.root, self.slopes = whitened @ self.gram[:, own], whitened @ products[:, own, 2 * m :]
+        b = whitened.transpose(0, 2, 1) @ self.slopes
         total = powers[:, 2 * m :]
-        reference = np.einsum("br,bri->bi", bands.noise[kept, : 2 * m], b**2)
+        reference = np.einsum("br,bri->bi", bands.noise[kept[:, None], own], b**2)
         left = np.maximum(total - np.sum(self.slopes**2, axis=1) + reference, NOISE_FLOOR**2 * total)
         self.told, self.left = np.maximum(total - left, 0.0), left
         self.points, self.white = bands.points[kept], reference + bands.noise[kept, 2 * m :]
@@ -113,7 +116,7 @@ class Factors:
         self.noise = np.maximum(np.sqrt(left / freedom[:, None] / bands.independent), TINY)
 
     def seen(self, response: Complex) -> Array:
-        """(..., A, 2 M B, M) whitened slopes of each axis, by channel, if V is `response` (..., B) times u."""
+        """(..., A, 2 N B, M) whitened slopes of each axis, by channel, if V is `response` (..., B) times u."""
         m = self.root.shape[2] // 2
         rows = response.real[..., None, None] * self.root[..., :m]
         rows += (response.imag / self.omega)[..., None, None] * self.root[..., m:]
@@ -121,11 +124,11 @@ class Factors:
         return np.asarray(rows.reshape(*response.shape[:-1], self.noise.shape[1], -1, m))
 
     def observed(self) -> Array:
-        """(A, 2 M B) whitened slopes of each axis."""
+        """(A, 2 N B) whitened slopes of each axis."""
         return np.asarray((self.slopes / self.noise[:, None, :]).transpose(2, 0, 1).reshape(self.noise.shape[1], -1))
 
     def by_row(self, values: Array) -> Array:
-        """Values of the bands (..., B) for each of the rows (..., 2 M B)."""
+        """Values of the bands (..., B) for each of the rows (..., 2 N B)."""
         return np.repeat(values, self.root.shape[1], axis=-1)
 
 
@@ -143,8 +146,10 @@ def _at_one_frequency(omega: float, channels: int, powers: int) -> Array:
 def _projected(factors: Factors, powers: int, omega2: Array) -> Array:
     """(K, 2M, M) see Banded. `omega2` (M,) is that of each channel in the whole window."""
     bands, m = _as_in_the_window(factors, omega2), factors.gram.shape[1] // 2
-    gram = bands.sum(axis=0)
-    gram[m + own_channels(m) :] = gram[:, m + own_channels(m) :] = 0.0  # an integral's derivative is no other motion
+    gram, real = bands.sum(axis=0), own_channels(m)
+    for k in range(real, m):  # below the bands an integral has noise, which makes the slope on it smaller
+        gram[k, k] = max(gram[k, k], gram[m + k, m + k] / omega2[k] if omega2[k] > 0.0 else 0.0)
+    gram[m + real :] = gram[:, m + real :] = 0.0  # an integral's derivative is no other motion
     scale = _unit(np.diag(gram))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), RELATED, hermitian=True) / np.outer(scale, scale)
     terms = by_term(factors.omega, powers)

@@ -146,27 +146,38 @@ def without_integrals(bands: BandSums) -> BandSums:
     return replace(bands, reference_channels=m, products=products, noise=bands.noise[:, kept])
 
 
-def without_noise(bands: BandSums, noise: Array) -> BandSums:
-    """The bands with motion, the power of the reference's white noise subtracted.
+def beside_reference_noise(bands: BandSums, reference_noise: Array, points: float, derivatives: int = 0) -> BandSums:
+    """The same bands with the white noise of the reference, of a quantity that was differentiated so often to give u.
 
-    `noise` (2, m): its rms in u and du/dt. Their ratio tells up to which frequency it is.
+    `reference_noise` (2, m): its rms of a point in u and du/dt, whose ratio tells up to which frequency it is;
+    `points`: of the whole window. A band that reaches beyond that frequency has none: `without_noise` does not keep it.
     """
-    m, channels, total = noise.shape[1], bands.reference_channels, float(bands.points.sum())
-    power = np.zeros_like(bands.noise)
-    power[:, -3:] = bands.noise[:, -3:]
-    kept = np.ones(len(power), dtype=bool)
-    own = bands.products.diagonal(axis1=1, axis2=2)
-    moved, moved_rate = own[:, :m].sum(axis=1), own[:, channels : channels + m].sum(axis=1)
-    for k in np.flatnonzero(noise[0] > 0.0):
-        end_hz = np.sqrt(3.0) * noise[1, k] / noise[0, k] / (2.0 * np.pi)
-        low, high = np.minimum(bands.low_hz, end_hz), np.minimum(bands.high_hz, end_hz)
-        power[:, k] = total * noise[0, k] ** 2 * (high - low) / end_hz
-        power[:, channels + k] = total * noise[1, k] ** 2 * (high**3 - low**3) / end_hz**3
-        kept &= (moved > OVER_NOISE * power[:, k]) & (moved_rate > OVER_NOISE * power[:, channels + k])
-        kept &= bands.high_hz <= end_hz
-    products = bands.products.copy()
-    products[:, range(2 * channels), range(2 * channels)] -= power[:, : 2 * channels]
-    return parts(replace(bands, products=products, noise=power), kept)
+    channels, noise = bands.reference_channels, bands.noise.copy()
+    of_u, of_rate = 2 * derivatives + 1, 2 * derivatives + 3  # powers of the frequency up to which it is summed
+    for k in np.flatnonzero(reference_noise[0] > 0.0).tolist():
+        u, rate = reference_noise[:, k].tolist()
+        end_hz = np.sqrt(of_rate / of_u) * rate / u / (2.0 * np.pi)
+        low, high = (np.where(bands.high_hz <= end_hz, edge, 0.0) / end_hz for edge in (bands.low_hz, bands.high_hz))
+        noise[:, k] = points * u**2 * (high**of_u - low**of_u)
+        noise[:, channels + k] = points * rate**2 * (high**of_rate - low**of_rate)
+    return replace(bands, noise=noise)
+
+
+def without_noise(bands: BandSums) -> BandSums:
+    """The bands with motion, the power of the reference's white noise subtracted."""
+    channels, m = bands.reference_channels, own_channels(bands.reference_channels)
+    own, noise = bands.products.diagonal(axis1=1, axis2=2)[:, : 2 * channels], bands.noise[:, : 2 * channels]
+    of_u, of_rate = noise[:, :m], noise[:, channels : channels + m]
+    moved, moved_rate = (own[:, of : of + m].sum(axis=1, keepdims=True) for of in (0, channels))
+    kept = ((of_u > 0.0) | ~of_u.any(axis=0)).all(axis=1)
+    kept &= ((moved > OVER_NOISE * of_u) & (moved_rate > OVER_NOISE * of_rate) | (of_u == 0.0)).all(axis=1)
+    products, size = bands.products.copy(), range(2 * channels)
+    products[:, size, size] -= noise
+    for k in range(m, channels):  # an integral has the noise of its channel, at each frequency
+        for i, j, times in ((k - m, channels + k, 2.0 * np.pi), (k, channels + k - m, -2.0 * np.pi)):
+            products[:, i, j] -= times * noise[:, k - m]
+            products[:, j, i] = products[:, i, j]
+    return parts(replace(bands, products=products), kept)
 
 
 @lru_cache(maxsize=4)

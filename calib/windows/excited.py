@@ -113,10 +113,12 @@ class Excitation:
             return None
         if not live.all():
             both = _columns(live, bands.reference_channels)
-            bands = replace(bands, products=np.where(np.outer(both, both), bands.products, 0.0))
-        # A noise of which only the most is known must not bend the response.
-        known = self.window.u_noise <= U_NOISE
-        return without_noise(bands, np.sqrt(self.noise) if known else np.zeros_like(self.noise))
+            products, noise = np.where(np.outer(both, both), bands.products, 0.0), np.where(both, bands.noise, 0.0)
+            bands = replace(bands, products=products, noise=noise)
+        if self.window.u_noise > U_NOISE:  # a noise of which only the most is known must not bend the response
+            channels = bands.reference_channels
+            bands = replace(bands, noise=np.where(np.arange(2 * channels + 3) < 2 * channels, 0.0, bands.noise))
+        return without_noise(bands)
 
 
 def excited_together(windows: Sequence[Window]) -> tuple[list[Excitation], Array]:

@@ -160,16 +160,12 @@ class Record:
         return replace(made, mean_x=self.mean_x, to_hz=to_hz, scores=self.scores, behind_k=self.behind_k)
 
     def _noise_within(self, bands: BandSums) -> Array | None:
-        """(2, M) rms of the reference's noise in points of these bands, the first ones of all: its density is even."""
-        assert self.bands is not None
+        """(2, m) rms of the reference's noise in a point of these bands, the first ones of all."""
         if self.reference_noise is None:
             return None
-        u, du = self.reference_noise
-        share = np.ones_like(u)  # of the noise's bandwidth
-        ends_hz = np.sqrt(3.0) * du[u > 0.0] / u[u > 0.0] / (2.0 * np.pi)
-        share[u > 0.0] = np.minimum(HIGHEST * bands.high_hz[-1] / ends_hz, 1.0)
-        fewer = float(self.bands.points.sum() / bands.points.sum())
-        return np.sqrt(fewer * np.array([share, share**3])) * self.reference_noise
+        own = self.reference_noise.shape[1]
+        powers = bands.noise[:, : 2 * self.channels].reshape(-1, 2, self.channels)[:, :, :own].sum(axis=0)
+        return np.asarray(np.sqrt(powers / bands.points.sum()))
 
     @property
     def channels(self) -> int:

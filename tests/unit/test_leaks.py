@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.model import Array, BandSums
-from calib.windows.bands import HANN, TAPER, band_sums, without_noise
+from calib.windows.bands import HANN, TAPER, band_sums, beside_reference_noise, without_noise
 
 RATE_HZ, N = 250.0, 15_000
 
@@ -61,8 +61,7 @@ def test_white_noise_is_taken_out_up_to_the_frequency_at_which_it_ends() -> None
     rate = 2.0 * np.pi * end_hz * n / np.sqrt(3.0) * (1.0 + 1e-9)
     strong = np.tile(1e6 * np.eye(5), (4, 1, 1))
     bands = BandSums(1, edges_hz[:-1], edges_hz[1:], np.full(4, 50.0), 1.0, strong, np.zeros((4, 5)), np.ones(4))
-    found = without_noise(bands, np.array([[n], [rate]]))
-    assert found is not None
+    found = without_noise(beside_reference_noise(bands, np.array([[n], [rate]]), 200.0))
     np.testing.assert_allclose(found.noise[:, 0], np.full(4, 50.0 * n**2), rtol=1e-6)
     shares = np.diff((edges_hz / end_hz) ** 3)
     np.testing.assert_allclose(found.noise[:, 1], 200.0 * rate**2 * shares, rtol=1e-6)

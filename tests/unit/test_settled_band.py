@@ -14,7 +14,7 @@ from agent.core.snapshot import pack, unpack
 from benchmarks.online import lorries
 from benchmarks.online.lorries import CALM_HZ, FAST_HZ, after, judged, take, window
 from calib.state.over_frequency import common_band
-from calib.windows.bands import motion_band_hz
+from calib.windows.bands import beside_reference_noise, motion_band_hz
 from calib.windows.record import WIDER, Record
 
 
@@ -92,7 +92,10 @@ def test_a_narrower_record_knows_the_present_certificate_of_the_reference() -> N
 def test_white_noise_of_the_reference_is_as_dense_in_a_narrower_band() -> None:
     rms = 1e-4
     white = np.outer([rms, rms * 2.0 * np.pi * 100.0 / np.sqrt(3.0)], np.ones(3))  # to half of the rate
-    narrow = calm(Record.of(replace(window(3, "W"), reference_noise=white), 0.0))
+    made = window(3, "W")
+    assert made.bands is not None
+    bands = beside_reference_noise(made.bands, white, made.points)
+    narrow = calm(Record.of(replace(made, reference_noise=white, bands=bands), 0.0))
     assert narrow.reference_noise is not None
     assert narrow.bands is not None
     u, du = narrow.reference_noise
