@@ -13,7 +13,7 @@ from agent.cli.main import run_cli
 from agent.core.snapshot import pack, unpack
 from benchmarks.online import lorries
 from benchmarks.online.lorries import CALM_HZ, FAST_HZ, after, judged, take, window
-from calib.state.over_frequency import common_band
+from calib.state.over_frequency import OverFrequency, common_band
 from calib.windows.bands import beside_reference_noise, motion_band_hz
 from calib.windows.record import WIDER, Record
 
@@ -50,6 +50,23 @@ def test_three_wide_windows_of_eight_widen_nothing_in_any_order(wide: int) -> No
         assert common_band(order)[:2] == narrow.motion_hz
     assert common_band([broad] * 7 + [narrow])[:2] == broad.motion_hz
     assert common_band([broad, replace(narrow, windows=3)])[:2] == narrow.motion_hz  # merged ones count as many
+
+
+def test_the_frequency_is_one_that_windows_without_a_train_tell_too() -> None:
+    """Two windows in which a train passes, with most motion at 6 Hz, settle it; then the band is that of the others.
+    Before, S held at 10.2 Hz, which no window told, so that it was never determined."""
+    narrow = Record.of(window(1), 0.0)
+    train = [replace(narrow, motion_hz=(2.9, 36.0), mean_hz=hz) for hz in (6.3, 5.0)]
+    others = [replace(narrow, motion_hz=(2.9, 6.8), mean_hz=3.4) for _ in range(6)]
+    over, before, settled_hz = OverFrequency(), list[Record](), list[float]()
+    for record in (*train, *others):
+        over = over.begun(record, before)
+        before.append(record)
+        settled_hz.append(over.at_hz)
+    assert over.motion_hz == (2.9, 6.8)
+    assert settled_hz == [6.3, *[5.0] * 7]
+    even = [replace(narrow, motion_hz=(2.0, 8.0), mean_hz=5.0) for _ in range(2)]  # motion of all frequencies alike
+    assert OverFrequency().begun(even[0], []).begun(even[1], even[:1]).at_hz == 4.0
 
 
 def test_a_blow_that_reaches_down_to_nothing_is_no_lower_end() -> None:
