@@ -68,7 +68,7 @@ class OverFrequency:
             over = replace(over, first_hz=self.first_hz or record.mean_hz)
         elif self.motion_hz is None and self.late_s is None and record.mean_hz:
             over = replace(self, first_hz=record.mean_hz, late_s=record.lag_s)
-        moving = [one.mean_hz for one in (*before, record) if one.mean_hz]
+        moving = [one.centre_hz for one in (*before, record) if one.mean_hz]
         if over.settled_hz or not record.mean_hz or len(moving) < 2:
             return over
         return replace(over, settled_hz=over._among(min(moving)))
@@ -89,17 +89,17 @@ class OverFrequency:
         """The frequency at which S holds where none is stated; 0 before any motion."""
         return self.settled_hz or self._among(self.first_hz)
 
-    def _among(self, mean_hz: float) -> float:
+    def _among(self, centre_hz: float) -> float:
         """The frequency at which S holds: the first one that moved if nothing else did or if it is in the band, else
-        the middle of the band, or the mean frequency `mean_hz` of a window where that is lower. Motion that comes and
-        goes, such as that of a lorry, reaches higher than what several windows have in common."""
+        the middle of the band, or that around which the motion of a window is, `centre_hz`, where that is lower. Motion
+        that comes and goes, such as that of a lorry, reaches higher than what several windows have in common."""
         if self.motion_hz is None:
             return self.first_hz
         low_hz, high_hz = self.motion_hz
         if self.late_s is not None and low_hz <= self.first_hz <= self.to_hz:
             return self.first_hz
         middle_hz = float(np.sqrt(low_hz * high_hz))
-        return mean_hz if low_hz < mean_hz < middle_hz else middle_hz
+        return centre_hz if low_hz < centre_hz < middle_hz else middle_hz
 
     def stating(self, band_hz: tuple[float, float] | None) -> Self:
         """The same where the band is stated; None: it is settled by windows."""

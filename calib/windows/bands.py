@@ -284,6 +284,17 @@ def lowest_hz(windows: Sequence[Window]) -> float:
     return _end(below, below, power, BELOW)
 
 
+def centre_hz(bands: BandSums, band_hz: tuple[float, float]) -> float:
+    """The mean frequency of the motion within a band, by the logarithm and the power: motion that is much faster than
+    most of it hardly moves it. 0 where there is no motion."""
+    inside = (bands.high_hz > band_hz[0]) & (bands.low_hz < band_hz[1])
+    power = np.where(inside, _powers(bands)[0], 0.0)
+    if not power.sum() > 0.0:
+        return 0.0
+    middle_hz = np.sqrt(np.maximum(bands.low_hz, 0.5 * bands.high_hz) * bands.high_hz)
+    return float(np.exp(power @ np.log(middle_hz) / power.sum()))
+
+
 def _narrowed(low_hz: Array, high_hz: Array, power: Array, square: Array) -> tuple[Array, Array]:
     """The ends of bands, nearer to their motion in a wide band of a short window: the derivative tells its frequency.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.model import Array, BandSums, Pose, Window, WindowSums
 from calib.signal.response import ALL_POWERS
-from calib.windows.bands import ABOVE, HIGHEST, motion_band_hz, parts, share_above
+from calib.windows.bands import ABOVE, HIGHEST, centre_hz, motion_band_hz, parts, share_above
 from calib.windows.condense import Condensed, condense, mean_frequency_hz, regressed
 from calib.windows.deviations import Deviations, LeftOpen
 from calib.windows.excited import MotionSums, excited, excited_together, excited_ways, motion_of
@@ -171,6 +171,13 @@ class Record:
     def channels(self) -> int:
         """M."""
         return len(self.along)
+
+    @property
+    def centre_hz(self) -> float:
+        """The frequency around which most of its motion is; 0 where nothing moves."""
+        if self.bands is None or self.motion_hz is None:
+            return self.mean_hz
+        return centre_hz(self.bands, self.motion_hz)
 
     @property
     def planar(self) -> bool:

@@ -85,6 +85,7 @@ REVISIONS = (
     Revision(22, "6120401ea8aa", "0.3.0"),
     # The last before a fast reference is not folded, and slow motion excites by its whole power.
     Revision(23, "5c157bb27d11", "0.3.0"),
+    Revision(24, "b1bf78ccaf86", "0.3.0"),
 )
 
 

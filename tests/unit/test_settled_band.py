@@ -13,8 +13,9 @@ from agent.cli.main import run_cli
 from agent.core.snapshot import pack, unpack
 from benchmarks.online import lorries
 from benchmarks.online.lorries import CALM_HZ, FAST_HZ, after, judged, take, window
+from calib.model import BandSums
 from calib.state.over_frequency import OverFrequency, common_band
-from calib.windows.bands import beside_reference_noise, motion_band_hz
+from calib.windows.bands import beside_reference_noise, centre_hz, motion_band_hz
 from calib.windows.record import WIDER, Record
 
 
@@ -55,7 +56,7 @@ def test_three_wide_windows_of_eight_widen_nothing_in_any_order(wide: int) -> No
 def test_the_frequency_is_one_that_windows_without_a_train_tell_too() -> None:
     """Two windows in which a train passes, with most motion at 6 Hz, settle it; then the band is that of the others.
     Before, S held at 10.2 Hz, which no window told, so that it was never determined."""
-    narrow = Record.of(window(1), 0.0)
+    narrow = replace(Record.of(window(1), 0.0), bands=None)
     train = [replace(narrow, motion_hz=(2.9, 36.0), mean_hz=hz) for hz in (6.3, 5.0)]
     others = [replace(narrow, motion_hz=(2.9, 6.8), mean_hz=3.4) for _ in range(6)]
     over, before, settled_hz = OverFrequency(), list[Record](), list[float]()
@@ -67,6 +68,18 @@ def test_the_frequency_is_one_that_windows_without_a_train_tell_too() -> None:
     assert settled_hz == [6.3, *[5.0] * 7]
     even = [replace(narrow, motion_hz=(2.0, 8.0), mean_hz=5.0) for _ in range(2)]  # motion of all frequencies alike
     assert OverFrequency().begun(even[0], []).begun(even[1], even[:1]).at_hz == 4.0
+
+
+def test_the_centre_of_a_motion_is_where_most_of_it_is() -> None:
+    """Bands of one width in the logarithm: 1 % of the power at 32 Hz beside the rest at 2 Hz."""
+    low_hz = np.array([1.9, 30.0])
+    products = np.array([np.eye(9) * power for power in (0.99, 0.01)])
+    products[:, :3, 6:] = products[:, 6:, :3] = products[:, :3, :3]
+    bands = BandSums(3, low_hz, low_hz * 1.1, np.full(2, 100.0), 1.0, products, np.zeros((2, 9)), np.ones(2))
+    at_hz = np.sqrt(1.1) * low_hz
+    np.testing.assert_allclose(centre_hz(bands, (1.0, 40.0)), at_hz[0] ** 0.99 * at_hz[1] ** 0.01, rtol=1e-9)
+    np.testing.assert_allclose(centre_hz(bands, (1.0, 20.0)), at_hz[0], rtol=1e-9)
+    assert centre_hz(bands, (5.0, 20.0)) == 0.0
 
 
 def test_a_blow_that_reaches_down_to_nothing_is_no_lower_end() -> None:
