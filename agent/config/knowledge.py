@@ -59,10 +59,11 @@ class Prior(Section):
     the data sheet's, which the drivers of the chips know. `offset` is in m/s2, as are its uncertainties. `corner_hz`
     and `u_corner_hz` are of an AC-coupled sensor (first order), 0 where it responds to constants. `filters` are the
     known ones of the sensor; left out, they are the driver's. S holds at `reference_frequency_hz`; 0 takes the middle
-    of the band of the first windows. `file` names an earlier result or a certificate of `fieldcal certificate` (JSON,
-    or DCC XML) instead: the program reads it once, at the start, and fills in `sensitivity`, `u_sensitivity`, and the
-    offset where the file knows it; of a certificate also `calibrated`, the date of this calibration. With a date it is
-    in force at a sensor without a reference, and its U grows from then on.
+    of the band of the first windows, or a lower one around which most of their motion is. `file` names an earlier
+    result or a certificate of `fieldcal certificate` (JSON, or DCC XML) instead: the program reads it once, at the
+    start, and fills in `sensitivity`, `u_sensitivity`, and the offset where the file knows it; of a certificate also
+    `calibrated`, the date of this calibration. With a date it is in force at a sensor without a reference, and its U
+    grows from then on.
     """
 
     file: Annotated[str, Field(description="result or certificate that states S and Q")] = ""
