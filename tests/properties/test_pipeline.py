@@ -20,13 +20,8 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @pytest.mark.slow
-@settings(max_examples=1)
-@given(seed=seeds, reference=st.booleans())
-@example(seed=9, reference=True)  # five calibrations, which few seeds have
-def test_restored_at_any_event_it_goes_on_alike_and_its_results_follow_from_each_other(
-    seed: int, reference: bool
-) -> None:
-    check(seed, reference)
+def test_restored_at_any_event_it_goes_on_alike_and_its_results_follow_from_each_other() -> None:
+    check(9, reference=True)  # five calibrations, which few seeds have
 
 
 @pytest.mark.thorough

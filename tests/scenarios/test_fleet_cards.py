@@ -445,7 +445,7 @@ def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
         watched.close()
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_more_tabs_than_a_browser_has_connections_and_a_copied_line_without_https(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:

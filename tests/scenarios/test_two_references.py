@@ -77,7 +77,7 @@ def test_a_second_reference_without_its_certificate_is_not_used() -> None:
     assert any("serial number another" in r.reason for r in results if isinstance(r, StatusChange))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("name", ["first reference", "sensor", "none"])
 def test_the_device_that_stepped_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(references, "TIMING", Timing(20.0, 60.0, 24))

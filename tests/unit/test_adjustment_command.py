@@ -94,7 +94,7 @@ def test_truth_lies_within_the_expanded_uncertainty(plain):
     assert np.sqrt(squares) == pytest.approx(told["standard_uncertainty"]["sensitivity"][0][0], rel=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_turned_static_sign_is_refused_with_status_3(session):
     result = _run(session, "--nominal", "1", "--u-nominal-pct", "20", "--static-sign", "-1", "--json", "-")
     told = _told(result)

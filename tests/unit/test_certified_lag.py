@@ -29,7 +29,7 @@ def test_a_reference_that_is_late_as_certified_calibrates() -> None:
     assert in_force.windows >= 6
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_reference_that_is_not_late_contradicts_its_certificate() -> None:
     found = begun(site_config(**S_AND_LAG)).play(8)
     assert said(found)[-1][0] == "HELD"

@@ -39,7 +39,7 @@ def errors(recording: Recording, **sections: Any) -> np.ndarray:
     return recording.errors_over_u(found.sensitivity, found.covariance, found.determined)
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("bench", [True, False], ids=["bench", "building"])
 @pytest.mark.parametrize("of", ["reference", "sensor"])
 def test_a_corner_as_uncertain_as_stated_calibrates(of: str, bench: bool) -> None:
@@ -116,7 +116,7 @@ def test_what_the_driver_mcc172_states_agrees_with_both_figures_of_the_data_shee
     assert -0.1 < at_5_2_hz < -0.09
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("corner_hz", [0.1, 0.5, 1.0])
 def test_a_coupling_whose_corner_the_driver_does_not_know_is_in_u(corner_hz: float) -> None:
     options = NiOptions.model_validate({"channels": ["cDAQ1Mod1/ai0"], "iepe_ma": 2.0})

@@ -21,7 +21,7 @@ CASES = {
 }
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("case", CASES)
 def test_s_is_right_within_its_uncertainty(case: str, tmp_path: Path) -> None:
     errors = []

@@ -136,7 +136,7 @@ def assert_same(shown: str, made: str) -> None:
         assert abs(float(old) - float(new)) <= allowed, f"{shown}\n{made}"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_the_guide_says_beforehand() -> None:
     for line in guided.outlooks()[2:]:
         assert_same(line_of("guided", line[: line.index("|", 2) + 1]), line)
@@ -158,7 +158,7 @@ def test_disturbances(monkeypatch: pytest.MonkeyPatch) -> None:
         assert_same(line_of("disturbed", line[: line.index("|", line.index("|", 1) + 1) + 1]), line)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_delay_of_the_drift_test() -> None:
     page = (ROOT / "docs/drift.md").read_text("utf-8")
     for name in ("step of 30 sigma", "step of 3 sigma", "step of 1 sigma", "ramp of 0.05 sigma a window"):

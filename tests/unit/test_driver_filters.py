@@ -131,7 +131,7 @@ def calibrated(path: Path, *options: str) -> list[list[float]]:
     return json.loads(out.read_text())["sensitivity"]  # type: ignore[no-any-return]
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     coupled = {**STATED, "reference": ("flat", "highpass corner_hz=0.01 u_corner_pct=30")}
     with_it, without = recorded(tmp_path / "a", coupled), recorded(tmp_path / "b", STATED)

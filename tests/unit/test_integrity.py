@@ -67,7 +67,7 @@ def assert_found(data: bytes, offset: int, flip: int, span: tuple[int, int]) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", [17, pytest.param(3, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("step", [17, pytest.param(3, marks=pytest.mark.nightly)])
 def test_every_changed_byte_is_found_in_its_record(recording: bytes, step: int) -> None:
     """Those near the begin of a record, which tells its kind and length, or its end; each `step`-th of the others."""
     flips = np.random.default_rng(1).integers(1, 256, len(recording))

@@ -121,7 +121,7 @@ def stretches(number: int, rate: float, lag_s: float, kept: list[weakref.ref[np.
         del V, u
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(("rate", "lag_s"), [(0.0, -0.09), (1.5e-4, 0.05), (-5e-5, 0.0)])
 def test_clocks_that_run_apart_are_found_by_correlation_without_holding_all_samples(rate: float, lag_s: float) -> None:
     kept: list[weakref.ref[np.ndarray]] = []

@@ -40,7 +40,7 @@ def z_of(outcome: Outcome, of: Made) -> np.ndarray:
     return ((outcome.values[:9] - of.sensitivity.ravel()) / outcome.standard_uncertainty[:9])[told]
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("kind", ["ellipse", "tones", "band"])
 @pytest.mark.parametrize("starts_and_stops", [False, True])
 def test_a_plane_tells_no_element_and_its_normal_is_named(kind: str, starts_and_stops: bool) -> None:

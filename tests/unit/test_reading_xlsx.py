@@ -120,7 +120,7 @@ HOSTILE = {
 }  # fmt: skip
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_a_hostile_workbook_ends_in_one_line(kind: str, tmp_path: Path) -> None:
     name, edit, told = HOSTILE[kind]

@@ -122,7 +122,7 @@ def test_the_response_is_told_as_it_is() -> None:
     assert abs(away) < 4.0 * at_0hz["standard_uncertainty"][0, 0]
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     "response",
     [lowpass(2, 7.0), lowpass(4, 10.0), lowpass(4, 8.0), resonance(7.0, 10.0), resonance(10.5, 30.0), highpass(0.2)],
@@ -136,7 +136,7 @@ def test_near_a_corner_or_a_resonance_s_is_right_or_refused(response: Filter) ->
         assert np.abs(error / u).max() < 4.0
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("response", [lowpass(4, 8.0), resonance(7.0, 10.0), highpass(0.2)])
 def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
     assert not_limited(pair(3, response)).reasons
@@ -151,7 +151,7 @@ def test_a_resonance_of_the_reference_within_slow_motion_is_refused(seed: int) -
     assert not_limited(made, reference=1e-3).calibration is None
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 @pytest.mark.parametrize("seed", [1, 5])
 def test_a_resonance_at_one_and_a_half_times_slow_motion(side: str, seed: int) -> None:
@@ -164,7 +164,7 @@ def test_a_resonance_at_one_and_a_half_times_slow_motion(side: str, seed: int) -
     assert np.abs(error / u).max() < 4.5
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("side", ["sensor", "reference"])
 @pytest.mark.parametrize("order", [1, 2])
 def test_an_unknown_corner_at_a_fifth_of_slow_motion(order: int, side: str) -> None:

@@ -33,7 +33,7 @@ def test_the_core_and_the_library_load_no_input_or_output() -> None:
     assert [name for name in loaded if name.partition(".")[0] in FORBIDDEN] == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_no_text_of_the_library_names_an_option_a_command_or_a_setting_of_the_agent() -> None:
     """Names in `...` are arguments of functions; the command line writes them as its options."""
     settings = [rf"\b{section}\.{field}\b" for section, of in Knowledge.model_fields.items()

@@ -115,7 +115,7 @@ def test_sensitivity_and_orientation_of_a_seismometer(
     assert not other.comments
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_accelerometer_beside_a_seismometer_feels_gravity(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found, _ = calibrated(site, "ACC", capsys)
     told = {each["channel"].rpartition(".")[2]: each for each in found["station"]}

@@ -263,7 +263,7 @@ def test_of_two_sensors_it_is_not_told_which_one_has_changed(gateway: list[int])
     assert kinds(turn) == {1: "turn"}
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_the_false_alarms_of_two_sensors_are_those_of_one_comparison() -> None:
     """The statistic of two sound sensors is a standard normal deviate, or less: over 16 sites its root mean square is
     at most 1.1. Were the scatter of their difference taken for half of it, as the level would have it, it were 1.28."""

@@ -50,7 +50,7 @@ def told(results: list[Result]) -> list[tuple[float, str]]:
     return [((change.t_utc_ns - EPOCH_NS) * 1e-9, change.reason) for change in changes]
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("coarse", "change", "since_s", "words"),
     [

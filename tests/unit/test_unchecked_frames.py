@@ -141,7 +141,7 @@ def damaged(frames: list[bytes], k: int, kind: str) -> Iterator[bytes]:
             yield from (whole[:i] + bytes([octet]) + whole[i:] for octet in (0x80, 0x0D, 0, 255, whole[i]))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("kind", ["cut", "lost", "added"])
 @pytest.mark.parametrize("changes", [CLOSED, COUNTED, CLOSED | COUNTED])
 def test_the_way_is_found_within_two_frames(changes: dict[str, Any], kind: str) -> None:
@@ -155,7 +155,7 @@ def test_the_way_is_found_within_two_frames(changes: dict[str, Any], kind: str) 
         assert set(lost) <= set(range(before, 20 + behind))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("kind", ["cut", "lost", "added", "flipped"])
 @pytest.mark.parametrize("name", ["sum16", "fletcher16"])
 def test_a_checksum_lets_no_damaged_frame_through(name: str, kind: str) -> None:
