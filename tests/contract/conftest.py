@@ -39,7 +39,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             continue
         more = adapter not in FOR_EACH_CHIP or access >= MORE_ACCESSES
         if chip == ON_ALL:
-            item.add_marker("thorough" if access >= MORE_ACCESSES else "slow")
+            item.add_marker("thorough" if more and "what_another_program" in item.name else "slow")
         else:
             item.add_marker("nightly" if more else "thorough")
         of_another = adapter not in FOR_EACH_CHIP and name_of(adapter) != own[chip]

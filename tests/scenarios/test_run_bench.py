@@ -52,8 +52,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         taker.start()
         with started("run", "--seed", str(SEED), "--data-dir", data_dir, output=output) as process:
             # Positions end after 13, 26, 39 and 52 s; three alphas determine all parameters, the fourth improves.
-            wait_until(lambda: len(results(data_dir, "calibration")) >= 2, THROUGH_S + 10, "two calibrations")
-            wait_until(lambda: len(results(data_dir, "clock")) >= 2, CLOCKS_S, "the clocks of a minute")
+            wait_until(
+                lambda: len(results(data_dir, "calibration")) >= 2, THROUGH_S + 10, "two calibrations", every_s=0.5
+            )
+            wait_until(lambda: len(results(data_dir, "clock")) >= 2, CLOCKS_S, "the clocks of a minute", every_s=0.5)
             late, clocks = late_client(KEY), late_client(CLOCK_KEY + "?after=0")
             stopped_in_s = interrupt(process)
         subscriber.undeclare()

@@ -73,12 +73,12 @@ def test_both_turned_are_named_where_the_sensor_is_known():
 
 @pytest.mark.slow
 def test_right_signs_are_not_refused():
-    """Ordinary recordings with fixed seeds: at one false alarm in a thousand, 97 % of such sets have none."""
+    """Ordinary recordings with fixed seeds: at one false alarm in a thousand, 99 % of such sets have none."""
     refused = [
         adjust(clamp_points(np.random.default_rng([6, seed]), ORDINARY).windows, _nominal()).reasons
-        for seed in range(30)
+        for seed in range(12)
     ]
-    assert refused == [()] * 30
+    assert refused == [()] * 12
 
 
 @pytest.mark.thorough
@@ -89,6 +89,7 @@ def test_swapped_axes_contradict_the_nominal():
     )
 
 
+@pytest.mark.slow
 def test_a_sensitivity_far_from_nominal_is_refused_with_the_numbers():
     found = adjust(clamp_points(np.random.default_rng(8), ORDINARY).windows, _nominal(size=2.0, u=0.1))
     assert "contradict" in _only_reason(found)

@@ -45,7 +45,7 @@ def run(
     return status, json.loads(captured.out) if captured.out else {}, captured.err
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("quantity", ["acceleration", "velocity"])
 def test_method_1_finds_all_of_s(tmp_path: Path, capsys: pytest.CaptureFixture[str], quantity: Any) -> None:
     reference = replace(plain(3).reference, quantity=quantity, noise=2e-4, resolution=1e-6)

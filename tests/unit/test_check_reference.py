@@ -193,7 +193,7 @@ def test_a_state_goes_on_bit_for_bit_while_windows_are_held() -> None:
     assert found.gate.held
     again = estimation()
     again.load(found.snapshot())
-    told = [judged(one, 109, 19, 8, STEPPED["first"]) for one in (found, again)]
+    told = [judged(one, 109, 19, 3, STEPPED["first"]) for one in (found, again)]
     assert "adopt" in actions(told[0])
     assert [t.decision.reason for t in told[0]] == [t.decision.reason for t in told[1]]
     assert np.array_equal(found.in_force.covariance, again.in_force.covariance)

@@ -92,10 +92,12 @@ def writers() -> dict[str, str]:
     return {name: module for module in modules for name in written(module)} | ELSEWHERE
 
 
+@pytest.mark.slow
 def test_every_part_has_a_writer_and_every_writer_a_part() -> None:
     assert set(writers()) == set(parts())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(name for name in parts() if ELSEWHERE.get(name, "benchmarks")))
 def test_the_columns_are_those_that_the_command_writes(name: str) -> None:
     module = writers()[name]

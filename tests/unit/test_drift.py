@@ -122,6 +122,7 @@ def test_sizes_hold_where_windows_tell_unequally(seed: int) -> None:
     assert after.change == pytest.approx(1.0, abs=4 * after.u_change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate_a_window", "within"), [(5.0, 6), (0.05, 60), (0.01, 160)])
 def test_a_ramp_is_told_as_drift_with_its_rate(rate_a_window: float, within: int) -> None:
     feed = Feed(7).windows(QUIET_WINDOWS).windows(3 * within + 20, lambda k: rate_a_window * k)
@@ -168,6 +169,7 @@ def test_two_windows_never_suffice(scores: list[float], information: float) -> N
         assert test.update(k * HOUR_S, np.full(12, score), np.full(12, 1.0 if k % 2 else information)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wild", [-1e6, CLIP, 30.0, 1e6])
 def test_a_single_wild_window_trips_nothing(wild: float) -> None:
     feed = Feed(11).windows(QUIET_WINDOWS).windows(1, lambda _: wild).windows(QUIET_WINDOWS)

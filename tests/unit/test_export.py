@@ -267,6 +267,7 @@ def test_plots_are_means_at_the_stated_rate(plots: Path, truth: tuple[np.ndarray
     assert told["U_Qz"] == newest.coverage_factor * newest.standard_uncertainty[11]
 
 
+@pytest.mark.slow
 def test_the_reader_of_ros_2_reads_the_accelerations(plots: Path) -> None:
     with RosBag(plots) as bag:
         assert [column.group for column in bag.columns] == ["/mems/acceleration"] * 4

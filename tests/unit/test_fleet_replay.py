@@ -192,6 +192,7 @@ def test_a_file_that_ends_its_process_is_refused_alone(
     assert "worker process ended" in told["files"][1]["reasons"][0]
 
 
+@pytest.mark.slow
 def test_a_reference_04_percent_low_makes_s_04_percent_low() -> None:
     """S is indication over acceleration, and the acceleration is indication over the reference's sensitivity. The prior
     of S, 5 %, holds S by a thirtieth."""

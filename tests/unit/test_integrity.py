@@ -160,6 +160,7 @@ def test_files_written_with_less_are_refused(options: dict[str, Any], reason: st
     assert any(reason in fault.reason for fault in check(out.getvalue()).faults)
 
 
+@pytest.mark.slow
 @given(data=st.binary(min_size=1, max_size=300), at=st.integers(0, 299), flip=st.integers(1, 255))
 def test_the_crc_tells_which_byte_changed(data: bytes, at: int, flip: int) -> None:
     at %= len(data)

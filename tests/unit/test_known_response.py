@@ -189,6 +189,7 @@ def test_the_table_of_a_certificate(files: tuple[list[str], Pair, Filter], tmp_p
     assert without["valid_band_hz"][1] < told["valid_band_hz"][1]
 
 
+@pytest.mark.slow
 def test_options_win_over_the_certificate(files: tuple[list[str], Pair, Filter], tmp_path: Path) -> None:
     options = files[0]
     path = certificate(tmp_path, lambda f: np.ones(len(f)) + 0j)

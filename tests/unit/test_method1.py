@@ -148,7 +148,7 @@ def test_data_that_cannot_be_used_are_named() -> None:
     assert any("its sign cannot be told" in reason for reason in late.reasons)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("rests_s", [(0.9, 0.0), (0.0, 1.3), (0.7, 0.8), (1.45, 0.6)])
 @pytest.mark.parametrize("lag_s", [0.0, 0.004])
 def test_rests_beside_the_sine_are_left_out(rests_s: tuple[float, float], lag_s: float) -> None:

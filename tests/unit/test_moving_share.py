@@ -31,6 +31,7 @@ def pair(seed: int, floor_mps2: float, own_mps2: float = OWN_MPS2) -> tuple[Arra
     return u, a @ S.T + SENSOR_MPS2 * random.standard_normal(a.shape), S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("floor_mps2", [0.0, 0.003, 0.01])
 def test_the_share_of_a_floor_that_moves_is_found(floor_mps2: float) -> None:
     motion, noise = floor_mps2**2 / 119.5, OWN_MPS2**2 / (0.5 * RATE_HZ)

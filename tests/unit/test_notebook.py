@@ -315,6 +315,7 @@ def test_the_figure_shows_s_q_response_and_windows(result: Outcome) -> None:
     assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_neither_matplotlib_nor_pandas_is_needed_until_plot() -> None:
     code = (
         "import sys; sys.modules['matplotlib'] = sys.modules['pandas'] = None\n"

@@ -84,6 +84,7 @@ def test_a_known_filter_is_no_unknown_of_one_frequency(order: int) -> None:
     assert max(u) < 0.0029  # 0.0025 if both instruments were known to respond alike; 0.004 with nothing stated
 
 
+@pytest.mark.slow
 def test_the_result_says_at_which_frequency_it_holds() -> None:
     more = calibrated(bench(6.0, lowpass_hz=31.0), 1, stated(**ANGLES)).more
     assert more["reference_frequency_hz"] == pytest.approx(6.0, rel=1e-3)

@@ -74,6 +74,7 @@ def test_after_restarts_it_is_the_calibration_that_was_made() -> None:
     assert (fresh.made, fresh.date_utc_ns) == ((fresh.run_id, fresh.sequence), fresh.t_utc_ns)
 
 
+@pytest.mark.slow
 def test_a_rollback_brings_back_the_calibration_that_was_made() -> None:
     site = begun(site_config())
     first = updates(site.play(3))[-1]

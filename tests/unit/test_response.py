@@ -137,7 +137,7 @@ def test_near_a_corner_or_a_resonance_s_is_right_or_refused(response: Filter) ->
 
 
 @pytest.mark.two_cases
-@pytest.mark.parametrize("response", [lowpass(4, 8.0), resonance(7.0, 10.0), highpass(0.2)])
+@pytest.mark.parametrize("response", [highpass(0.2), lowpass(4, 8.0), resonance(7.0, 10.0)])
 def test_what_no_smooth_response_explains_is_refused(response: Filter) -> None:
     assert not_limited(pair(3, response)).reasons
 
@@ -228,6 +228,7 @@ def test_a_few_points_by_chance_are_no_result() -> None:
     assert "points in motion can be used, at least 5% are needed" in reason
 
 
+@pytest.mark.slow
 def test_a_band_that_deviates_is_named() -> None:
     def notched(frequency_hz: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
         return np.asarray(1.0 - 0.3 * np.exp(-0.5 * ((frequency_hz - 6.0) / 0.3) ** 2) + 0j)

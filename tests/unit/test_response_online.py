@@ -20,7 +20,7 @@ from hw.virtual.building import Building
 from hw.virtual.building_motion import BuildingSpectrum
 from tests.pair import Filter, both, flat, highpass, lowpass, moving_mean, resonance
 
-SEED, WINDOWS = 1, 8
+SEED, WINDOWS = 1, 6
 BROAD = BuildingSpectrum(0.5, 12.0)
 FILTERS = {
     "flat": flat,

@@ -185,6 +185,7 @@ def test_metadata_are_for_miniseed(tmp_path: Path) -> None:
         read_reference(tmp_path / "a.csv", described=Description(tmp_path / "b.xml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "message"),
     [

@@ -179,7 +179,9 @@ def test_the_page_reads_what_the_agent_says_of_held_windows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("behaviour", ["sound", pytest.param("drifting", marks=pytest.mark.thorough), "stepped"])
+@pytest.mark.parametrize(
+    "behaviour", ["sound", *(pytest.param(other, marks=pytest.mark.thorough) for other in ("drifting", "stepped"))]
+)
 def test_u_covers_the_truth(behaviour: Behaviour) -> None:
     results, truth = told(behaviour)
     last = [r for r in results if isinstance(r, CalibrationUpdate)][-1]

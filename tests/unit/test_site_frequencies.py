@@ -97,6 +97,7 @@ def test_sound_frequencies_follow_the_temperature_and_are_not_told() -> None:
     assert [len(after(40, seed=seed).frequencies) for seed in range(2)] == [0, 0]
 
 
+@pytest.mark.slow
 def test_what_one_sensor_sees_alone_is_not_the_structure() -> None:
     assert not after(20, in_window(2, 0.05, slice(0, 1))).frequencies
     assert not after(20, in_window(2, 0.05, slice(0, 2))).frequencies

@@ -268,6 +268,7 @@ def test_the_innovation_is_chi_squared_and_each_score_normal() -> None:
     np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.17)  # a variance of 1.5 is seen
 
 
+@pytest.mark.slow
 def test_a_change_moves_a_score_by_what_the_information_says() -> None:
     random, found = np.random.default_rng(8), mounted()
     for k in range(10):
@@ -299,6 +300,7 @@ def test_a_snapshot_goes_on_bit_for_bit() -> None:
     np.testing.assert_array_equal(other.result().covariance, going_on.result().covariance)
 
 
+@pytest.mark.slow
 def test_an_operators_calibration_is_where_it_goes_on_from() -> None:
     random, found = np.random.default_rng(10), mounted()
     for k in range(5):
@@ -333,6 +335,7 @@ def test_asking_what_a_first_window_says_changes_nothing() -> None:
     assert pack(found.snapshot()) == before
 
 
+@pytest.mark.slow
 def test_a_certificate_of_q_does_not_hide_how_the_mount_leans() -> None:
     # Q known to 1 mm/s2, the mount to 0.2 deg: under gravity that is 34 mm/s2 of mean output nobody stated.
     u = np.append(U[:9] / 1000.0, np.full(3, 1e-3))

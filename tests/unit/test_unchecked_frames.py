@@ -103,6 +103,7 @@ def test_a_counter_rises_evenly() -> None:
     assert list(map(bytes, found.frames)) == frames[2:89]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [COUNTED, CLOSED | COUNTED])
 def test_two_halves_of_different_frames_are_no_sample(changes: dict[str, Any]) -> None:
     """Bytes were lost until the same byte of a later frame: start and end fit. The counter, which is behind the other

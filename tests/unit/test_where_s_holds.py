@@ -157,6 +157,7 @@ def tones(u_reference_pct: float, **stated: Any) -> Outcome:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("u_reference_pct", [0.1, 0.5])
 def test_the_band_in_which_s_is_right_is_judged_for_each_element(u_reference_pct: float) -> None:
     """u of a transverse element decided on the main ones: "from 3.49 to 3.78 Hz" excluded the motion that was used."""
@@ -197,6 +198,7 @@ def weak(known: KnownResponse) -> tuple[Pair, Outcome]:
     return made, adjusted(made.files, stated.beside_known(known) if known.is_stated else stated)
 
 
+@pytest.mark.slow
 def test_a_response_that_noise_makes_up_is_refused_with_a_remedy_that_works() -> None:
     """Terms of the response up to ten times what filters have; with none left to the data S is right."""
     _, found = weak(UNKNOWN)
