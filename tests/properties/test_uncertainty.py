@@ -202,7 +202,7 @@ def q_drifts(draw: Drawn) -> World:
 @case
 def the_drift_of_q_walks(draw: Drawn) -> World:
     """Day by day: the rate of each day moves Q on this day. Two windows told the rate of the beginning."""
-    u, days, walk, most = (0.01, 0.5), 50, 2e-5, 1e-3
+    u, days, walk, most = (0.01, 0.5), 100, 2e-5, 1e-3
     S, Q = s_and_q(draw, u)
     rate = SCALE * most * draw("rate")
     records = [told(BESIDE, Truth(S, Q), 0.0), told(BESIDE, Truth(S, Q + 1.0 * rate), 1.0)]
@@ -627,7 +627,7 @@ def noise_of_means_that_were_merged(draw: Drawn) -> World:
 @case
 def a_walk_within_windows_that_were_merged(draw: Drawn) -> World:
     """Their mean differs from S and Q in the middle of their time, to which they are ascribed."""
-    u, count = (0.5, 50.0), 20
+    u, count = (0.5, 50.0), 40
     S, Q = s_and_q(draw, u)
     steps = draw("walk", 2 * count).reshape(2, count) * np.array([[1e-4], [0.1]]) * SCALE * np.sqrt(10.0 / (count - 1))
     steps[:, [0, -1]] *= np.sqrt(0.5)  # from the middle to the windows on both sides
@@ -644,7 +644,7 @@ def a_walk_within_windows_that_were_merged(draw: Drawn) -> World:
 @case
 def a_reference_that_drifts_within_windows_that_were_merged(draw: Drawn) -> World:
     """S is known, so that they tell the drift in the middle of their time, but for what it walked before and after."""
-    u, count, days = (1e-6, 0.01), 20, 100.0
+    u, count, days = (1e-6, 0.01), 40, 100.0
     S, Q = s_and_q(draw, u)
     steps = draw("walk", 2 * count).reshape(2, count) * 0.005 * np.sqrt(days / 365.25 / (count - 1))
     steps[:, [0, -1]] *= np.sqrt(0.5)

@@ -263,7 +263,7 @@ def test_old_windows_are_merged_while_it_runs_and_judging_goes_on(a_day: float, 
     random = np.random.default_rng(15)
     found = estimation()
     made = [building_window(random) for _ in range(10)]
-    numbers = range(160)
+    numbers = range(120)
     for k in numbers:
         assert found.judge(made[k % 10], k / a_day, 0.0, 20.0).decision.action == "take"
         assert len(found.snapshot()["state"]["records"]) <= most
