@@ -143,7 +143,7 @@ def test_output_says_what_was_found_published_and_recorded(run: Run) -> None:
         assert part in run.output, part
 
 
-def test_replay_and_audit_agree_with_the_run(run: Run) -> None:
+def test_replay_agrees_with_the_run(run: Run) -> None:
     files = recordings(run.data_dir)
     replayed = fieldcal("replay", *files, "--json", "-")
     assert replayed.returncode == 0, replayed.stderr
@@ -151,8 +151,6 @@ def test_replay_and_audit_agree_with_the_run(run: Run) -> None:
     assert told["equal"] is True
     kept = results(run.data_dir, "calibration")
     assert [c["sensitivity"] for c in told["calibrations"]] == [c["sensitivity"] for c in kept]
-    audited = fieldcal("audit", *files)
-    assert audited.returncode == 0, audited.stdout + audited.stderr
 
 
 def test_show_tells_the_calibration_in_force(run: Run) -> None:
