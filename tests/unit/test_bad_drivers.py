@@ -32,7 +32,7 @@ from tests.scenarios.processes import ROOT, fieldcal, recordings, wait_until
 from tests.unit.buggy_driver import BUGS, IN_BLOCKS, NOT_FIRST, install
 
 STANDS = {"start_s": 0, "stop_s": 3600, "gravity_mps2": [0, 0, 9.81]}
-TOGETHER = 34  # devices with a bug in one run
+TOGETHER = 24  # devices with a bug in one run
 
 
 def name_of(bug: str) -> str:
