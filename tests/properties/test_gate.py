@@ -158,7 +158,7 @@ def test_statuses_change_as_the_table_says(settings_: GateSettings, steps_: list
     assert _walk(Site(settings_, calibrated=calibrated), steps_) <= TABLE
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_every_row_of_the_table_happens() -> None:
     """Runs of 40 steps from 160 seeds, and one way that is too rare for them: nothing in the table is there in vain."""
     near, far = calibration(), calibration(NOMINAL * 1.2)

@@ -63,6 +63,7 @@ def test_a_stop_is_taken_back_and_a_session_ended_early(tmp_path):
     assert [float(field) for field in poses[1].split(",")[2:]] == pytest.approx([-9.80665, 0.0, 0.0])
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

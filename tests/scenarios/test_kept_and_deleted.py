@@ -77,6 +77,7 @@ def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice, capsys: pytest.Ca
     assert json.loads(capsys.readouterr().out)["sensors"]["imu"]["windows"]
 
 
+@pytest.mark.thorough
 def test_a_signing_key_that_is_none_is_bad_input(tmp_path: Path, port: PtyDevice) -> None:
     key, config = tmp_path / "key", tmp_path / "config.toml"
     key.write_text("no key")

@@ -237,7 +237,7 @@ def test_nuisances_are_shown_where_all_is_asked_for(session, table):
     assert all(len(line) <= 80 for line in table.splitlines()), table
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_parameter_that_the_prior_tells_has_its_posterior_and_a_star(session, tmp_path):
     files = [part for name in ("sensor", "reference", "poses") for part in (f"--{name}", str(session / f"{name}.csv"))]
     covariance = np.diag([1e-8] * 9 + [1.0] * 3).tolist()

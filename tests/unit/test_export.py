@@ -86,7 +86,7 @@ def uff_sets(path: Path) -> list[tuple[list[str], list[float]]]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_uff_has_each_signal_with_unit_direction_and_times(
     recorded: Path, truth: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

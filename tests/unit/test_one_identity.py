@@ -138,7 +138,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_report_after_a_restart_shows_the_run_in_which_it_was_made(recorded: Path, tmp_path: Path) -> None:
     before = gather([recorded], None)
     directory = tmp_path / "data"

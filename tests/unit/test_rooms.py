@@ -24,7 +24,7 @@ print(*sorted(sys.modules))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_core_and_the_library_load_no_input_or_output() -> None:
     run = subprocess.run([sys.executable, "-c", WALK], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = run.stdout.split()

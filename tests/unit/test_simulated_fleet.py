@@ -55,7 +55,7 @@ def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
         assert fleet.step(T_NS + DAY_NS) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_every_result_arrives_once_in_order_and_signed_and_forged_ones_are_refused(site: Site, tmp_path: Path) -> None:
     with (
         SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet,
@@ -144,6 +144,7 @@ def test_s_is_near_its_nominal_value_until_it_changes(behaviour: Behaviour) -> N
     np.testing.assert_allclose(truth.sensitivity / NOMINAL, np.eye(3), atol=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("behaviour", "verdict"), [("drifting", "drifting"), ("stepped", "stepped"), ("held", "stepped")]
