@@ -48,7 +48,7 @@ tested = $(BIN)/python -m pytest -n $(1) --dist loadscope --no-loadscope-reorder
 # The drivers' contract reads so many samples, and where a device counts them in 16 bits more than these hold;
 # `pytest tests/contract` reads a million.
 test: export FIELDCAL_CONTRACT_SAMPLES = 2000
-test-all test-thorough: export FIELDCAL_CONTRACT_SAMPLES = 5000
+test-all test-thorough nightly: export FIELDCAL_CONTRACT_SAMPLES = 5000
 test: $(VENV)/development  ## before a merge: what decides whether results, uncertainties, recordings and the program are right
 	$(call tested,$(PROCESSES),-m "not faults and not thorough") || $(call once_more,-m "not faults and not thorough")
 
@@ -58,13 +58,14 @@ test-quick: $(VENV)/development  ## before a commit: modules, properties and dri
 	$(call tested,$(PROCESSES),-m "not faults and not thorough and not slow" tests/unit tests/properties tests/contract)
 
 test-thorough: $(VENV)/development  ## what `make test` leaves out: worlds of months, other adapters, more seeds
-	$(call tested,$(PROCESSES),-m thorough) || $(call once_more,-m thorough)
+	$(call tested,$(PROCESSES),-m "thorough and not nightly") || $(call once_more,-m "thorough and not nightly")
 
 # In one run: what waits for programs in one part leaves the processors to the other.
-test-all: $(VENV)/development  ## all tests that need neither root nor hardware
-	$(call tested,$(PROCESSES),-m "not faults") || $(call once_more,-m "not faults")
+test-all: $(VENV)/development  ## the tests that need neither root nor hardware, but for those of each night
+	$(call tested,$(PROCESSES),-m "not faults and not nightly") || $(call once_more,-m "not faults and not nightly")
 
-nightly: $(VENV)/development  ## the twins under Debian's kernel in QEMU; needs qemu-system-x86, busybox-static and Debian's apt
+nightly: $(VENV)/development  ## what `make test-all` leaves out; the twins under Debian's kernel in QEMU, which needs qemu-system-x86, busybox-static and Debian's apt
+	$(call tested,$(PROCESSES),-m nightly) || $(call once_more,-m nightly)
 	$(BIN)/python -m tests.nightly
 
 lint: $(VENV)/development

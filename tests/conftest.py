@@ -89,18 +89,22 @@ def takes_scenarios(node: WorkerController) -> bool:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of a test marked `one_case`, all cases but the first are thorough.
+    """Of a test marked `one_case`, all cases but the first are thorough; of one marked `two_cases`, all but the first
+    two are nightly.
 
     Files with many slow tests come first: as one of the last they would keep one process busy while others have ended.
     """
-    seen = set[str]()
+    seen = Counter[str]()
     for item in items:
-        if item.get_closest_marker("one_case"):
+        two = item.get_closest_marker("two_cases") is not None
+        if two or item.get_closest_marker("one_case"):
             item.add_marker("slow")
             name = item.nodeid.partition("[")[0]
-            if name in seen:
-                item.add_marker("thorough")
-            seen.add(name)
+            if seen[name]:
+                item.add_marker("nightly" if two and seen[name] > 1 else "thorough")
+            seen[name] += 1
+        if item.get_closest_marker("nightly"):
+            item.add_marker("thorough")
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 

@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from agent.engine import identity
 from agent.engine.keeping import keep_engine
+from agent.engine.wheel import ENGINES
 from agent.recording.files import recordings
 from agent.recording.retention import KeepFiles
 from tests.attacks.chain_site import KEY
@@ -55,8 +56,9 @@ class Site:
         for name, gateway, key in (("epoch", GATEWAY, KEY), ("gateway", "site/other", KEY), ("key", GATEWAY, OTHER)):
             first_run(directory / name, 3, [], gateway=gateway, key=key)
             second_run(directory / name, 4, [], gateway=gateway, key=key)
-        for name in ("true", "earlier", "fork", "epoch", "gateway", "key"):
-            keep_engine(directory / name)
+        keep_engine(true)
+        for name in ("earlier", "fork", "epoch", "gateway", "key"):
+            shutil.copytree(true / ENGINES, directory / name / ENGINES)
         return Site(directory, heads)
 
 

@@ -43,14 +43,14 @@ class Outcome:
     reasons: tuple[tuple[str, int], ...]
 
 
-def harmed(kind: str, seed: int) -> Outcome:
+def harmed(kind: str, seed: int, timing: Timing = TIMING) -> Outcome:
     """Simulate one run with a fault of this kind ("" for none); everything is drawn from the seed."""
     random = np.random.default_rng([seed, 7])
     harm = KINDS[kind](random) if kind else HARMLESS
     since = KNOWN_WINDOWS * int(random.integers(2)) if kind else 0
-    drawn = node(seed, all_axes=bool(random.integers(2)), harm=harm, harmed_from=since, timing=TIMING, chip_hz=CHIP_HZ)
+    drawn = node(seed, all_axes=bool(random.integers(2)), harm=harm, harmed_from=since, timing=timing, chip_hz=CHIP_HZ)
     run = Run(drawn.config)
-    results = [r for event in visits(drawn.building, range(TIMING.windows)) for r in run.feed(event)]
+    results = [r for event in visits(drawn.building, range(timing.windows)) for r in run.feed(event)]
     return _outcome(kind, harm.name, seed, drawn, since, results)
 
 

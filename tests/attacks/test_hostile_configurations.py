@@ -21,7 +21,7 @@ HOSTILE: dict[str, Callable[[], str]] = {
 }
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("name", HOSTILE)
 def test_faults_without_number_are_told_in_bounded_time(tmp_path: Path, name: str) -> None:
     path = tmp_path / "c.toml"

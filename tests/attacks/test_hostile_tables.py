@@ -168,7 +168,7 @@ def test_a_pose_that_lasts_for_ever_takes_no_time(start_s: float, stop_s: float)
     assert 300 < window.points <= 400
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     "text",
     [
@@ -205,7 +205,7 @@ def with_a_broken_clock(snapshot: bytes) -> bytes:
     return pack(state)
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("damage", [lambda held: held + b"\0", without_channels, with_a_broken_clock])
 @pytest.mark.parametrize("command", REFUSED)
 def test_a_recording_whose_snapshot_is_damaged_is_refused_in_one_line(

@@ -78,6 +78,7 @@ def run(*arguments: str | Path, env: dict[str, str] | None = None, shell: str = 
     )
 
 
+@pytest.mark.thorough
 def test_a_program_without_standard_streams_runs(tmp_path: Path) -> None:
     data = tmp_path / "data"
     told = run("run", "--data-dir", data, "--duration", "1.5", shell=">&- <&-")

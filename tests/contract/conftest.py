@@ -23,7 +23,7 @@ ACCESSES, MORE_ACCESSES = 4, 12  # of `what_another_program`
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """`make test-quick` has two kinds of adapter and few accesses of other programs, `make test` the others for one
-    chip, `make test-all` one more for each, and more accesses."""
+    chip, `make test-all` more accesses, and `make nightly` one more kind for each chip."""
     chips = [item for item in items if isinstance(item, pytest.Function)]
     chips = [item for item in chips if issubclass(item.cls or object, I2cContract)]
     others: defaultdict[str, list[str]] = defaultdict(list)
@@ -37,7 +37,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         access = int(str(item.callspec.params["seed"])) if "what_another_program" in item.name else 0
         if adapter in FOR_EACH_CHIP and access < ACCESSES:
             continue
-        item.add_marker("slow" if chip == ON_ALL else "thorough")
+        more = adapter not in FOR_EACH_CHIP or access >= MORE_ACCESSES
+        if chip == ON_ALL:
+            item.add_marker("thorough" if more and "what_another_program" in item.name else "slow")
+        else:
+            item.add_marker("nightly" if more else "thorough")
         of_another = adapter not in FOR_EACH_CHIP and name_of(adapter) != own[chip]
         if chip != ON_ALL and (of_another or access >= MORE_ACCESSES):
             left_out.append(item)

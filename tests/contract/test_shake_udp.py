@@ -286,6 +286,7 @@ def test_datagrams_with_the_ends_of_the_range() -> None:
         assert (found.start_ns, found.samples.tolist()) == (start_ns, counts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", range(0, len(DATAGRAMS[1].rstrip()), 1))
 def test_a_datagram_that_is_cut_is_none(at: int) -> None:
     with pytest.raises(shake_datagram.DatagramError):

@@ -15,7 +15,7 @@ from calib.model import Window
 from tests.clamp_windows import Faults, clamp_points
 
 SEEDS = st.integers(0, 2**32 - 1)
-FEW = settings(max_examples=10, deadline=None)
+FEW = settings(max_examples=6, deadline=None)
 ORDINARY = Faults(theta_rad=0.003, offset_mps2=0.05, lag_s=0.001)
 # The search ends at a thousandth of a standard uncertainty, from where the next step is smaller still: what changes
 # nothing in exact arithmetic may move the result by about a millionth of u, and differently so.

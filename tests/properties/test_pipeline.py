@@ -14,30 +14,31 @@ from agent.core.events import CalibrationUpdate, Result, StatusChange, WindowRep
 from agent.core.pipeline import Pipeline
 from tests.properties.happenings import EPOCH_NS, ORIGIN_NS, config, happenings
 
-EVENTS = 300
+EVENTS, FEW_EVENTS = 300, 120
 LONGEST_S = 1.5  # of the schedule's poses, guards taken off, and a sample
 seeds = st.integers(0, 2**32 - 1)
 
 
 @pytest.mark.slow
-@settings(max_examples=1)
-@given(seed=seeds, reference=st.booleans())
-@example(seed=9, reference=True)  # five calibrations, which few seeds have
+@pytest.mark.parametrize(
+    ("seed", "reference", "events"), [(9, True, FEW_EVENTS), (1, False, EVENTS), (2, False, EVENTS)]
+)
 def test_restored_at_any_event_it_goes_on_alike_and_its_results_follow_from_each_other(
-    seed: int, reference: bool
+    seed: int, reference: bool, events: int
 ) -> None:
-    check(seed, reference)
+    check(seed, reference, events)
 
 
 @pytest.mark.thorough
 @settings(max_examples=2)
 @given(seed=seeds, reference=st.booleans())
-@example(seed=35, reference=True)  # five calibrations, too
+@example(seed=9, reference=True)  # 10 windows contradict the calibration, of 44
+@example(seed=35, reference=True)  # 8 of 32
 def test_so_it_is_with_more_seeds(seed: int, reference: bool) -> None:
     check(seed, reference)
 
 
-def check(seed: int, reference: bool) -> None:
+def check(seed: int, reference: bool, events: int = EVENTS) -> None:
     """A run that is restored now and then gives the results of one that goes on."""
     settings_ = config(reference)
     config_json = settings_.model_dump_json()
@@ -45,7 +46,7 @@ def check(seed: int, reference: bool) -> None:
     restored = Pipeline.begin(settings_, "run", ORIGIN_NS, 7, {})
     places = np.random.default_rng(seed)
     results: list[Result] = []
-    for event in happenings(seed, EVENTS, moving=reference):
+    for event in happenings(seed, events, moving=reference):
         if places.random() < 0.2:
             restored = Pipeline.restore(config_json, restored.snapshot())
         new = going_on.step(event)

@@ -86,7 +86,7 @@ def forged(directory: Path, engine: str, forge: Forge, signer: Signer | None = N
     return directory / RECORDING
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("directory", [*FORMATS, GOLDEN / "engine-8"], ids=lambda path: path.name)
 def test_an_earlier_recording_is_undecided_without_its_engine_and_passes_with_it(
     directory: Path, tmp_path: Path

@@ -75,7 +75,7 @@ def computed(process: EngineProcess, path: Path) -> Iterator[tuple[str, bytes]]:
             give = process.step
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("directory", EARLIER, ids=lambda path: path.name)
 def test_an_earlier_engine_gives_the_results_that_it_recorded(directory: Path) -> None:
     engine, wheel = engine_wheel(directory)

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.online.agreement import LIMIT_U, Both, bench_day, building
 
 
-@pytest.mark.parametrize("recording", [bench_day, building])
-@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("recording", [building, pytest.param(bench_day, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.nightly)])
 def test_files_and_agent_agree(recording: Callable[[int], Both], seed: int) -> None:
     both = recording(seed)
     # A hole in one visit may cut it for the agent, which sees blocks, and not for the file, which sees stamps.

@@ -71,8 +71,7 @@ def plugged(directory: Path, **twins: EpsonTwin | MipTwin) -> Iterator[list[str]
         yield paths
 
 
-@pytest.mark.thorough
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_init_finds_both_and_run_calibrates(tmp_path: Path) -> None:
     path, data_dir = tmp_path / "gateway.toml", tmp_path / "data"
     with plugged(tmp_path, epson=epson(), mip=microstrain()) as (sensor, reference):

@@ -74,6 +74,7 @@ def test_reads_that_beat_with_the_samples_cost_no_window(seed: int) -> None:
     assert np.all(np.abs(found - truth) < 4.0 * np.array(update.standard_uncertainty))
 
 
+@pytest.mark.thorough
 def test_with_free_angles_s_and_q_are_within_their_uncertainty() -> None:
     """The stops are not given either. All 12 parameters must be within 4 u; chance alone fails once in 1300 days."""
     world = bench.world(SEED)

@@ -102,7 +102,7 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
         monitor.stop()
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_killed_program_is_shown_as_silent(site: Site, tmp_path: Path, browser: Any) -> None:
     monitor = Monitor(site.endpoint, tmp_path / "monitor")
     command = [sys.executable, "-m", "agent", "bench", "-o", str(tmp_path / "out"), "--virtual", "gravity"]

@@ -68,8 +68,7 @@ def side_by_side() -> Iterator[tuple[PtyDevice, ShakeTwin]]:
         sensor.stop()
 
 
-@pytest.mark.thorough
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_sensor_beside_three_geophones_becomes_valid(tmp_path: Path) -> None:
     config, data_dir, output = tmp_path / "gateway.toml", tmp_path / "data", tmp_path / "output"
     with side_by_side() as (sensor, shake):

@@ -89,7 +89,7 @@ def plugged(chip: Chip) -> Iterator[tuple[Bench, UmockdevSite, PtyDevice]]:
 
 @pytest.mark.thorough
 @pytest.mark.skipif(ABSENCE is not None, reason=str(ABSENCE))
-@pytest.mark.parametrize("name", list(CHIPS))
+@pytest.mark.parametrize("name", ["adxl355", pytest.param("icm20948", marks=pytest.mark.nightly)])
 def test_a_chip_becomes_valid(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chip = CHIPS[name]
     data_dir, config, output = tmp_path / "data", tmp_path / "gateway.toml", tmp_path / "output"

@@ -41,10 +41,12 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "page", [pytest.param(p, marks=[] if p.name in FIRST else pytest.mark.thorough, id=p.name) for p in PAGES]
 )
-def test_documented_commands_run(page: Path, tmp_path: Path, data_dir: Path) -> None:
+def test_documented_commands_run(page: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
-    for directory in (data_dir, data_dir.with_name("keys")):
-        shutil.copytree(directory, tmp_path / directory.name)
+    if any(name in line for line in commands(page) for name in ("data", "keys")):
+        data_dir: Path = request.getfixturevalue("data_dir")
+        for directory in (data_dir, data_dir.with_name("keys")):
+            shutil.copytree(directory, tmp_path / directory.name)
     for line in commands(page):
         words = shlex.split(line)
         if words[0] == "make":

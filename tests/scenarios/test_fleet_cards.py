@@ -28,7 +28,7 @@ from agent.monitor.settings import FloorPlan
 from tests.scenarios.fleet_page import DAY_NS, IMAGES, axe_faults
 from tests.unit.monitor_site import Monitor, Served
 
-pytestmark = needs_chromium
+pytestmark = [needs_chromium, pytest.mark.thorough]
 SHIFTS = """
 window.moved = 0;
 new PerformanceObserver((l) => l.getEntries().forEach((e) => { if (!e.hadRecentInput) moved += e.value; }))
@@ -346,7 +346,6 @@ def test_a_page_hears_its_monitor_while_nothing_changes(
         watched.close()
 
 
-@pytest.mark.thorough
 def test_a_page_whose_monitor_hangs_looks_old_and_goes_on_when_it_answers_again(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:
@@ -370,7 +369,6 @@ def test_a_page_whose_monitor_hangs_looks_old_and_goes_on_when_it_answers_again(
     monitor.stop()
 
 
-@pytest.mark.thorough
 def test_names_on_the_plan_cover_no_other(site: Site, tmp_path: Path, browser: Any) -> None:
     """Twelve sensors in three rows, so near that not all names find a place beside their points."""
     places = {f"site/gw/deck-{k:02}": ((k % 4) / 3, 0.3 + 0.02 * (k // 4)) for k in range(12)}
@@ -398,7 +396,6 @@ def test_names_on_the_plan_cover_no_other(site: Site, tmp_path: Path, browser: A
         watched.close()
 
 
-@pytest.mark.thorough
 def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:
@@ -445,7 +442,7 @@ def test_a_card_that_comes_or_goes_moves_nothing_until_it_is_asked_for(
         watched.close()
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_more_tabs_than_a_browser_has_connections_and_a_copied_line_without_https(
     site: Site, tmp_path: Path, browser: Any
 ) -> None:

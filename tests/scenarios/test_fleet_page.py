@@ -82,7 +82,7 @@ def assert_the_five_questions_are_answered(shown: PageSite, page: Any) -> None:
     assert "mount" in held["next"]
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_drifting_sensor_rises_is_sorted_opened_and_zoomed(site: Site, tmp_path: Path, browser: Any) -> None:
     places = {f"simulated/gw000{k}/s0": (0.1 + 0.1 * k, 0.5) for k in range(8)}
     plan = FloorPlan(picture=PICTURE, positions=places)

@@ -48,7 +48,7 @@ def test_a_clamp_with_a_wrong_turn(tmp_path):
     assert (tmp_path / "out" / "result.json").read_bytes() == before
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_stop_is_taken_back_and_a_session_ended_early(tmp_path):
     """A position is named by the person, one is taken back, a wrong name is told; the files hold what was kept."""
     answers = iter(["", "u", "no position", "-x", "q"])
@@ -63,6 +63,7 @@ def test_a_stop_is_taken_back_and_a_session_ended_early(tmp_path):
     assert [float(field) for field in poses[1].split(",")[2:]] == pytest.approx([-9.80665, 0.0, 0.0])
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -50,6 +50,7 @@ def test_an_output_that_takes_nothing_is_one_line(tmp_path: Path) -> None:
     assert (told.returncode, told.stderr) == (1, "fieldcal: [Errno 28] No space left on device\n")
 
 
+@pytest.mark.thorough
 def test_an_output_without_unicode_gets_what_it_can_take(tmp_path: Path) -> None:
     command: list[str | Path] = [sys.executable, "-m", "agent", "show", "--data-dir", filled(tmp_path)]
     ascii_only = os.environ | {"PYTHONIOENCODING": "ascii"}

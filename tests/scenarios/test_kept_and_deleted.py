@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from agent.cli.main import run_cli
 from hw.virtual.serial_port import PtyDevice
 from tests.replay.test_audit_chain import write_keys
 from tests.scenarios.processes import fieldcal, interrupt, recordings, results, started, wait_until
@@ -22,7 +23,7 @@ def number(path: Path) -> int:
 
 
 @pytest.mark.slow
-def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
+def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice, capsys: pytest.CaptureFixture[str]) -> None:
     private, public = write_keys(tmp_path)
     config, data, output = tmp_path / "config.toml", tmp_path / "data", tmp_path / "output"
     config.write_text(config_text(port, private, KEPT))
@@ -44,14 +45,13 @@ def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
     left = recordings(data)
     assert number(left[0]) > 3, "the oldest are deleted"
     assert number(left[-1]) - number(left[0]) == len(left) - 1
-    said = fieldcal("audit", data, "--public-key", public)
-    assert said.returncode == 0, said.stdout + said.stderr
+    assert run_cli(["audit", str(data), "--public-key", str(public)]) == 0, capsys.readouterr()
 
     taken = left[1].read_bytes()
     left[1].unlink()
-    said = fieldcal("audit", data)
-    assert said.returncode == 3
-    assert f"recording {number(left[1])} is missing before it" in said.stdout
+    capsys.readouterr()
+    assert run_cli(["audit", str(data)]) == 3
+    assert f"recording {number(left[1])} is missing before it" in capsys.readouterr().out
     left[1].write_bytes(taken)
 
     windows = results(data, "window")
@@ -73,9 +73,11 @@ def test_a_life_of_recordings(tmp_path: Path, port: PtyDevice) -> None:
     found = [window for window in windows if window["sequence"] in again]
     assert found
     assert all(again[window["sequence"]] == window for window in found)
-    assert json.loads(fieldcal("show", "--data-dir", data, "--json", "-").stdout)["sensors"]["imu"]["windows"]
+    assert run_cli(["show", "--data-dir", str(data), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["sensors"]["imu"]["windows"]
 
 
+@pytest.mark.thorough
 def test_a_signing_key_that_is_none_is_bad_input(tmp_path: Path, port: PtyDevice) -> None:
     key, config = tmp_path / "key", tmp_path / "config.toml"
     key.write_text("no key")

@@ -42,7 +42,7 @@ AT_LEAST = {"nothing wrong", "10 % lost", "clock step", "reference unplugged", "
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in AT_LEAST else pytest.param(name, marks=pytest.mark.thorough) for name in WORLDS]
+    "name", [name if name in AT_LEAST else pytest.param(name, marks=pytest.mark.nightly) for name in WORLDS]
 )
 def test_a_recording_replays_bit_for_bit(name: str, tmp_path: Path) -> None:
     building, config = WORLDS[name]
@@ -73,6 +73,7 @@ def test_going_on_from_any_window_equals_going_on(tmp_path: Path) -> None:
     assert compared > TIMING.windows
 
 
+@pytest.mark.thorough
 def test_a_harmed_run_says_the_same_twice() -> None:
     assert harm.harmed("clock step", 11) == harm.harmed("clock step", 11)
 

@@ -27,7 +27,7 @@ from tests.scenarios.operators_day import WINDOW_S, Site
 from tests.scenarios.processes import fieldcal, interrupt, recordings, results
 
 HOUR_S = 3600
-pytestmark = pytest.mark.thorough
+pytestmark = pytest.mark.nightly
 U_PRIOR_PCT = 2.0
 MAIN, TRANSVERSE = [0, 4, 8], [1, 2, 3, 5, 6, 7]
 

@@ -74,7 +74,7 @@ POSES = {
 }
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("reference", "channel"),
     [

@@ -52,8 +52,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         taker.start()
         with started("run", "--seed", str(SEED), "--data-dir", data_dir, output=output) as process:
             # Positions end after 13, 26, 39 and 52 s; three alphas determine all parameters, the fourth improves.
-            wait_until(lambda: len(results(data_dir, "calibration")) >= 2, THROUGH_S + 10, "two calibrations")
-            wait_until(lambda: len(results(data_dir, "clock")) >= 2, CLOCKS_S, "the clocks of a minute")
+            wait_until(
+                lambda: len(results(data_dir, "calibration")) >= 2, THROUGH_S + 10, "two calibrations", every_s=0.5
+            )
+            wait_until(lambda: len(results(data_dir, "clock")) >= 2, CLOCKS_S, "the clocks of a minute", every_s=0.5)
             late, clocks = late_client(KEY), late_client(CLOCK_KEY + "?after=0")
             stopped_in_s = interrupt(process)
         subscriber.undeclare()
@@ -141,7 +143,7 @@ def test_output_says_what_was_found_published_and_recorded(run: Run) -> None:
         assert part in run.output, part
 
 
-def test_replay_and_audit_agree_with_the_run(run: Run) -> None:
+def test_replay_agrees_with_the_run(run: Run) -> None:
     files = recordings(run.data_dir)
     replayed = fieldcal("replay", *files, "--json", "-")
     assert replayed.returncode == 0, replayed.stderr
@@ -149,8 +151,6 @@ def test_replay_and_audit_agree_with_the_run(run: Run) -> None:
     assert told["equal"] is True
     kept = results(run.data_dir, "calibration")
     assert [c["sensitivity"] for c in told["calibrations"]] == [c["sensitivity"] for c in kept]
-    audited = fieldcal("audit", *files)
-    assert audited.returncode == 0, audited.stdout + audited.stderr
 
 
 def test_show_tells_the_calibration_in_force(run: Run) -> None:

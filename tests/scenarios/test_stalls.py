@@ -9,6 +9,8 @@ import sys
 import threading
 from pathlib import Path
 
+import pytest
+
 from agent.acquisition.service import Service
 from agent.acquisition.stalls import few_objects
 from agent.config import Config, parse_config
@@ -57,6 +59,7 @@ STANDS = {"start_s": 0, "stop_s": 3600, "gravity_mps2": [0, 0, 9.81]}
 FEW = 10_000  # objects that the collector examines in 2 ms; a run makes about 700, the modules have 50,000
 
 
+@pytest.mark.thorough
 def test_the_collector_walks_through_what_the_run_made_only(tmp_path: Path) -> None:
     options = {"port": str(tmp_path / "absent"), "rate_hz": 100, "axes": 3, "unit": "m/s2"}
     config = parse_config(

@@ -229,7 +229,7 @@ def lost(data_dir: Path) -> set[str]:
     return {name for name, state in last.items() if state == "lost"}
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_the_same_chips_over_spi(tmp_path: Path) -> None:
     chips = {name: (twin, rate_hz) for name, (twin, _, rate_hz) in DEVICES.items() if twin.spi_modes}
     buses = {

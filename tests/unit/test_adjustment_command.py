@@ -94,7 +94,7 @@ def test_truth_lies_within_the_expanded_uncertainty(plain):
     assert np.sqrt(squares) == pytest.approx(told["standard_uncertainty"]["sensitivity"][0][0], rel=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_turned_static_sign_is_refused_with_status_3(session):
     result = _run(session, "--nominal", "1", "--u-nominal-pct", "20", "--static-sign", "-1", "--json", "-")
     told = _told(result)
@@ -127,6 +127,7 @@ def test_an_earlier_result_serves_as_prior_and_may_be_contradicted(session, plai
     assert _run(session, *STATED, "--prior", str(prior)).return_value == 3
 
 
+@pytest.mark.slow
 def test_the_same_data_again_add_too_little_to_be_a_result(session, plain, tmp_path):
     prior = tmp_path / "prior.json"
     prior.write_text(plain.stdout)
@@ -145,6 +146,7 @@ def test_a_prior_that_is_none_is_bad_input(session, tmp_path, text):
     assert "prior.json" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_reference_that_is_ac_coupled_gives_its_corner(tmp_path):
     """Stated at 0.16 Hz within 0.03, truly 0.13: found to 2 mHz, and S is right to 0.1 % though 0.5 Hz is in it."""
     stands = tuple(clamped(35.0, alpha, 8.0) for alpha in (0.0, 30.0, 120.0, 210.0))
@@ -201,7 +203,7 @@ def test_too_few_rests_are_refused(tmp_path):
     assert "10 rests" in result.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_table_ends_with_s_q_the_band_and_the_three_largest_sources(session, table):
     lines = table.splitlines()
     told = _told(_run(session, "--json", "-"))
@@ -226,6 +228,7 @@ def test_the_table_ends_with_s_q_the_band_and_the_three_largest_sources(session,
         assert float(Q) == pytest.approx(k * budget[name]["Qz"], rel=0.06)
 
 
+@pytest.mark.slow
 def test_nuisances_are_shown_where_all_is_asked_for(session, table):
     whole = _run(session, "--all").stdout
     nuisances = [line for line in whole.splitlines() if line not in table.splitlines()]
@@ -234,7 +237,7 @@ def test_nuisances_are_shown_where_all_is_asked_for(session, table):
     assert all(len(line) <= 80 for line in table.splitlines()), table
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_parameter_that_the_prior_tells_has_its_posterior_and_a_star(session, tmp_path):
     files = [part for name in ("sensor", "reference", "poses") for part in (f"--{name}", str(session / f"{name}.csv"))]
     covariance = np.diag([1e-8] * 9 + [1.0] * 3).tolist()
@@ -252,6 +255,7 @@ def test_a_parameter_that_the_prior_tells_has_its_posterior_and_a_star(session, 
     assert "* known before: the data do not halve its uncertainty" in result.stdout
 
 
+@pytest.mark.slow
 def test_the_certificate_of_the_reference_is_in_the_result_and_tells_its_u(session: Path, tmp_path: Path) -> None:
     certificate = tmp_path / "reference.toml"
     certificate.write_text('[certificate]\nserial_number = "R-9"\nsensitivity = 10.2\nu_sensitivity_pct = 0.3\n')

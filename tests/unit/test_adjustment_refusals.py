@@ -52,7 +52,7 @@ def test_one_alpha_is_refused_with_the_rank():
     assert "rank 2 of 4" in _only_reason(found)
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("priors", [Priors(), Priors.none(), _nominal()])
 def test_z_outward_with_the_printed_signs_names_the_sign(priors):
     windows = _turned(clamp_points(np.random.default_rng(3), ORDINARY).windows, static=-1.0)
@@ -73,12 +73,12 @@ def test_both_turned_are_named_where_the_sensor_is_known():
 
 @pytest.mark.slow
 def test_right_signs_are_not_refused():
-    """Ordinary recordings with fixed seeds: at one false alarm in a thousand, 97 % of such sets have none."""
+    """Ordinary recordings with fixed seeds: at one false alarm in a thousand, 99 % of such sets have none."""
     refused = [
         adjust(clamp_points(np.random.default_rng([6, seed]), ORDINARY).windows, _nominal()).reasons
-        for seed in range(30)
+        for seed in range(12)
     ]
-    assert refused == [()] * 30
+    assert refused == [()] * 12
 
 
 @pytest.mark.thorough
@@ -89,6 +89,7 @@ def test_swapped_axes_contradict_the_nominal():
     )
 
 
+@pytest.mark.slow
 def test_a_sensitivity_far_from_nominal_is_refused_with_the_numbers():
     found = adjust(clamp_points(np.random.default_rng(8), ORDINARY).windows, _nominal(size=2.0, u=0.1))
     assert "contradict" in _only_reason(found)
@@ -138,7 +139,9 @@ def test_planar_motion_at_two_frequencies_parts_lag_and_rotation():
 def test_a_misfit_of_the_size_of_the_signal_is_refused():
     """A sensor that was turned by 40 deg on the clamp in one of five positions: no S a + Q explains that."""
     faults = Faults(alpha_rad={300.0: 40.0 * DEGREE}, offset_mps2=0.05)
-    windows = clamp_points(np.random.default_rng(11), faults, alphas_deg=(0.0, 30.0, 120.0, 210.0, 300.0)).windows
+    windows = clamp_points(
+        np.random.default_rng(11), faults, alphas_deg=(0.0, 30.0, 120.0, 210.0, 300.0), repetitions=1
+    ).windows
     assert any("unexplained" in reason or "contradict" in reason for reason in adjust(windows, _nominal()).reasons)
 
 
@@ -161,7 +164,7 @@ def _reference_times(windows: list[Window], factor: float) -> list[Window]:
     ]
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("factor", [1.2, 0.8, 2.0])
 def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(factor):
     windows = _reference_times(clamp_points(np.random.default_rng(20), ORDINARY).windows, factor)
@@ -173,9 +176,9 @@ def test_a_reference_that_gravity_contradicts_is_refused_without_a_nominal(facto
 
 @pytest.mark.slow
 def test_nuisances_drawn_from_their_priors_pull_as_such():
-    """Pull over its limit in 40 sound recordings: a twice too small spread would bring one above 1."""
+    """Pull over its limit in 20 sound recordings: a twice too small spread would bring one above 1."""
     pulls = []
-    for seed in range(40):
+    for seed in range(20):
         random = np.random.default_rng([21, seed])
         alpha = {a: float(random.normal(0.0, 0.2 * DEGREE)) for a in (0.0, 30.0, 120.0, 210.0)}
         faults = Faults(float(random.normal(0.0, 0.2 * DEGREE)), float(random.normal(0.0, 0.1 * DEGREE)), alpha, 0.05)

@@ -147,6 +147,7 @@ def ask(address: str, path: str, **arguments: str) -> Any:
         return json.load(answer)["data"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(PROMETHEUS is None, reason="prometheus is not installed (Debian's package prometheus)")
 def test_a_real_prometheus_fires_for_a_drifting_sensor_and_a_silent_gateway(prometheus: str) -> None:
     def firing() -> set[str] | None:

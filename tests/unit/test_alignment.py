@@ -139,7 +139,7 @@ APART = {
 }
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("reference", ["dc", pytest.param("ac", marks=pytest.mark.thorough)])
 @pytest.mark.parametrize(
     ("minutes", "to_hz", "ppm", "lag_s"),

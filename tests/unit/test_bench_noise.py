@@ -137,7 +137,7 @@ def test_rotation_is_one() -> None:
     assert rotation(np.array([0.0, 0.0, 1.0]), np.pi / 2) @ [1, 0, 0] == pytest.approx([0, 1, 0], abs=1e-14)
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("seed", range(8))
 def test_presets_are_what_they_say(seed) -> None:
     simple, hard = plain(seed), faulty(seed)

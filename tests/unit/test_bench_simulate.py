@@ -170,6 +170,7 @@ def test_a_loop_goes_on_one_interval_after_the_end(tmp_path) -> None:
     assert not player.finished
 
 
+@pytest.mark.slow
 def test_a_recording_is_played_whole_at_its_own_pace_and_the_port_ends_with_it(tmp_path) -> None:
     rows = [f"{k / 100:.2f},{k}.250,{-k},0" for k in range(80)]
     path = write(tmp_path, "\n".join(["time_s,vx,vy,vz", *rows, ""]))
@@ -190,6 +191,7 @@ def test_a_recording_is_played_whole_at_its_own_pace_and_the_port_ends_with_it(t
     assert not link.is_symlink()
 
 
+@pytest.mark.slow
 def test_a_reader_that_sets_its_port_up_slowly_and_reads_late_loses_nothing(tmp_path) -> None:
     path = write(tmp_path, SENSOR)
     whole = b"# playing\n1,-2.50,3e-1\n4,5,6\n7,8,9\n10,11,12\n"

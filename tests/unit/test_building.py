@@ -146,6 +146,7 @@ def visited(harm: Harm, visit: int = 2, **changes: Any) -> tuple[list[SampleBloc
     return Building(parameters, 6).visit(visit), Building(parameters, 6, harm, 2).visit(visit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_harm_begins_when_it_says_and_changes_something(kind: str) -> None:
     harm = KINDS[kind](np.random.default_rng(1))

@@ -57,6 +57,7 @@ def errors(found: dict[str, Any], bench: Bench) -> tuple[float, float]:
     return 100 * dS, dQ
 
 
+@pytest.mark.slow
 def test_plain_bench_is_found(recorded: tuple[Path, Bench], capsys: pytest.CaptureFixture[str]) -> None:
     directory, bench = recorded
     status, found, said = run(capsys, *arguments(directory))
@@ -89,6 +90,7 @@ def test_the_table_for_people(recorded: tuple[Path, Bench], capsys: pytest.Captu
     assert " ± " in out
 
 
+@pytest.mark.slow
 def test_a_velocity_reference_is_differentiated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     p = plain(7)
     bench = files(
@@ -276,6 +278,7 @@ def test_poses_that_nobody_recorded_are_told(
     assert "do not overlap in time" in said
 
 
+@pytest.mark.slow
 def test_plain_too_is_refused_where_what_was_known_contradicts_it(
     recorded: tuple[Path, Bench], capsys: pytest.CaptureFixture[str]
 ) -> None:

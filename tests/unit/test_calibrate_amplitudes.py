@@ -45,7 +45,7 @@ def run(
     return status, json.loads(captured.out) if captured.out else {}, captured.err
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("quantity", ["acceleration", "velocity"])
 def test_method_1_finds_all_of_s(tmp_path: Path, capsys: pytest.CaptureFixture[str], quantity: Any) -> None:
     reference = replace(plain(3).reference, quantity=quantity, noise=2e-4, resolution=1e-6)
@@ -84,7 +84,7 @@ def test_method_2_finds_main_sensitivities_within_u(tmp_path: Path, capsys: pyte
     assert "rel_S_pct" not in found["statistics"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_the_methods_cannot_use_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files(tmp_path, ON_CLAMP)
     status, found, said = run(tmp_path, capsys, 1)

@@ -11,6 +11,7 @@ LATE_S = 0.005
 S_AND_LAG = {"uncertainty": {"lag_s": 1e-4}, "certificate": {"lag_s": LATE_S, "u_lag_s": 1e-4}}
 
 
+@pytest.mark.slow
 def test_a_reference_that_is_late_as_certified_calibrates() -> None:
     site = begun(site_config(**S_AND_LAG))
     site.late_s["r"] = LATE_S
@@ -29,7 +30,7 @@ def test_a_reference_that_is_late_as_certified_calibrates() -> None:
     assert in_force.windows >= 6
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_reference_that_is_not_late_contradicts_its_certificate() -> None:
     found = begun(site_config(**S_AND_LAG)).play(8)
     assert said(found)[-1][0] == "HELD"

@@ -60,6 +60,7 @@ def test_a_device_that_comes_back_goes_on_with_the_next_window() -> None:
     assert ("VALID", "s sends data again") in said(site.results)
 
 
+@pytest.mark.slow
 def test_another_reference_is_told_and_taken_by_its_own_certificate() -> None:
     site = begun(site_config(certificate={"u_sensitivity_pct": 0.3}))
     site.play(4)
@@ -164,6 +165,7 @@ def test_restored_in_the_midst_it_goes_on_bit_for_bit() -> None:
     assert [r for r in site.results if isinstance(r, Estimate)]
 
 
+@pytest.mark.slow
 def test_a_state_made_with_another_configuration_goes_on_with_what_is_stated_now() -> None:
     site = begun(site_config())
     before = updates(site.play(4))[-1]

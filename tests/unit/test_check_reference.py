@@ -116,9 +116,9 @@ def test_each_reference_has_its_own_unknowns_and_priors() -> None:
 @pytest.mark.parametrize(("which", "device", "other"), [("first", "r", "c"), ("second", "c", "r")])
 def test_the_reference_that_stepped_is_named_and_s_does_not_follow(which: str, device: str, other: str) -> None:
     found, control = sound(), sound()
-    judged(control, 101, 12, 24)
+    judged(control, 101, 12, 12)
     before = found.in_force
-    results = judged(found, 101, 12, 24, STEPPED[which])
+    results = judged(found, 101, 12, 12, STEPPED[which])
     reason = adopted(results)
     assert f"the reference {device} has changed by y +" in reason
     assert f"windows with {other} still agree with S" in reason
@@ -139,9 +139,9 @@ def test_a_reference_that_is_stated_not_to_drift_is_named_too() -> None:
 @pytest.mark.slow
 def test_if_both_see_the_step_it_is_the_sensor_and_u_does_not_grow() -> None:
     found, control = sound(), sound()
-    judged(control, 102, 12, 12)
-    results = judged(found, 102, 12, 12, SENSOR)
-    assert actions(results) == ["hold"] * 4 + ["adopt"] + ["take"] * 7
+    judged(control, 102, 12, 8)
+    results = judged(found, 102, 12, 8, SENSOR)
+    assert actions(results) == ["hold"] * 4 + ["adopt"] + ["take"] * 3
     assert "so the sensor has changed" in adopted(results)
     u = found.in_force.standard_uncertainty
     # Not as small as without a step: what S owes to the time when the references had drifted less is lost.
@@ -156,7 +156,7 @@ def test_while_nobody_else_tells_u_covers_both_until_the_other_reference_does() 
     alone = judged(found, 103, 12, 5, STEPPED["first"], turns=(FIRST,) * 5)
     assert "no window with c tells whether the sensor or the reference r has changed" in adopted(alone)
     assert found.in_force.standard_uncertainty[SYY] == pytest.approx(S_TRUE[1, 1] * STEP / 1.6, rel=0.1)
-    judged(found, 104, 17, 12, STEPPED["first"])
+    judged(found, 104, 17, 8, STEPPED["first"])
     u = found.in_force.standard_uncertainty[SYY]
     assert u < 1.5 * before.standard_uncertainty[SYY]
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1]) < 3 * u
@@ -193,7 +193,7 @@ def test_a_state_goes_on_bit_for_bit_while_windows_are_held() -> None:
     assert found.gate.held
     again = estimation()
     again.load(found.snapshot())
-    told = [judged(one, 109, 19, 8, STEPPED["first"]) for one in (found, again)]
+    told = [judged(one, 109, 19, 3, STEPPED["first"]) for one in (found, again)]
     assert "adopt" in actions(told[0])
     assert [t.decision.reason for t in told[0]] == [t.decision.reason for t in told[1]]
     assert np.array_equal(found.in_force.covariance, again.in_force.covariance)

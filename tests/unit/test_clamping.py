@@ -32,6 +32,7 @@ def _seen(way: Clamped, seed: int = 3, seconds: float = SECONDS) -> tuple[Visit,
     return visit, found
 
 
+@pytest.mark.slow
 def test_a_good_clamp_has_no_findings():
     for seed in range(3):
         _, found = _seen(Clamped(), seed)
@@ -39,7 +40,7 @@ def test_a_good_clamp_has_no_findings():
         assert found.coherence > 0.99
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "by_deg", [(0.0, 0.0, 5.0), (-7.0, 0.0, 0.0), (3.0, -4.0, 3.0), (0.0, 0.0, 90.0), (180.0, 0, 0)]
 )
@@ -53,6 +54,7 @@ def test_a_turned_reference_is_told_with_its_angle(by_deg):
     assert np.sign(found.turned_deg[2]) == np.sign(by_deg[2]) or by_deg[2] == 0.0
 
 
+@pytest.mark.slow
 def test_a_clamp_on_a_spring_is_loose():
     """At 25 Hz of resonance, a mass on a spring shows (f / 25 Hz)^2 too much: 29 % at 13.5 Hz."""
     _, found = _seen(Clamped(loose=True))

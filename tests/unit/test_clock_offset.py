@@ -45,7 +45,7 @@ def beside(offset_s: float, ppm: float = 0.0, bands: str = "broad", other: int |
     return calibrate((sensor_s * (1.0 + 1e-6 * ppm) + offset_s, V), (reference_s, a), rotation=np.eye(3))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("offset_s", "ppm", "bands"), [(1.7, 30.0, "broad"), (-6.3, 0.0, "broad"), (2.9, -100.0, "two modes")]
 )
@@ -69,7 +69,7 @@ def test_clocks_in_step_are_not_moved() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("bands", BANDS_HZ)
+@pytest.mark.parametrize("bands", ["two modes", pytest.param("broad", marks=pytest.mark.thorough)])
 def test_devices_that_do_not_move_together_are_refused(bands: str) -> None:
     found = beside(0.0, bands=bands, other=2)
     assert found.status == "refused"

@@ -30,7 +30,7 @@ def test_a_reader_that_has_ended_is_no_fault(command: str) -> None:
     assert _ended(*command.split()) == (1, b"")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_tables_on_a_terminal_neither(tmp_path: Path) -> None:
     """The tables of a calibration are drawn by another library than the rest of the output."""
     samples = tmp_path / "sensor.csv"

@@ -63,6 +63,7 @@ def test_a_rollback_carries_the_calibration_whole(site: DeskSite) -> None:
     assert (kept["sequence"], kept["sensor"], len(kept["covariance"])) == (101, "mems", 12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "verb", "make"),
     [
@@ -224,6 +225,7 @@ def test_a_script_that_runs_wild_with_a_good_key_is_slowed(site: DeskSite) -> No
     assert site.desk.counts() == {"taken": taken, "too many": 60 - taken}
 
 
+@pytest.mark.slow
 def test_mutated_commands_are_refused_unless_an_operator_signed_them(site: DeskSite) -> None:
     """2000 here; benchmarks/fuzz.py does 10^5."""
     random_ = random.Random(20)

@@ -93,6 +93,7 @@ def gateway(site: Site, tmp_path: Path) -> Iterator[Gateway]:
     gateway.stop()
 
 
+@pytest.mark.slow
 def test_a_first_meeting_begins_with_the_values_in_force_then_all(site: Site, gateway: Gateway) -> None:
     gateway.send(3)
     gateway.send(1, "calibration")
@@ -130,6 +131,7 @@ def test_only_the_keys_asked_for_come_and_all_of_them(site: Site, gateway: Gatew
     follower.stop()
 
 
+@pytest.mark.slow
 def test_a_router_that_dies_and_comes_back_loses_nothing_and_keeps_the_order(site: Site, gateway: Gateway) -> None:
     gateway.publisher.start()
     wait_for(lambda: gateway.publisher.state().connected)

@@ -39,13 +39,13 @@ def errors(recording: Recording, **sections: Any) -> np.ndarray:
     return recording.errors_over_u(found.sensitivity, found.covariance, found.determined)
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("bench", [True, False], ids=["bench", "building"])
 @pytest.mark.parametrize("of", ["reference", "sensor"])
 def test_a_corner_as_uncertain_as_stated_calibrates(of: str, bench: bool) -> None:
-    found = np.array([errors(Recording(k, drawn(k, of), bench=bench), **SECTIONS[of]) for k in range(3)])
+    found = np.array([errors(Recording(k, drawn(k, of), bench=bench), **SECTIONS[of]) for k in range(2)])
     assert np.isfinite(found).all()
-    # 27 errors a case, those of one recording in common through its angles: u is right when their root mean square is
+    # 18 errors a case, those of one recording in common through its angles: u is right when their root mean square is
     # about 1. Without the corner it is 2.5 in the building.
     assert np.sqrt(np.mean(found**2)) < 1.6
     assert np.abs(found).max() < 3.5
@@ -104,7 +104,7 @@ def test_what_the_driver_mcc172_states_is_undone(hz: float, low: float) -> None:
     error, U = beside_an_mcc172(hz, 0.78, stated=False)
     assert error == pytest.approx(1.0 / (1.0 - low) - 1.0, rel=0.2)  # the reference reads low: S is too large
     assert (error > U).all()
-    for corner_hz in (0.78, 0.71, 0.85):  # as uncertain as stated
+    for corner_hz in (0.71, 0.85):  # as uncertain as stated
         error, U = beside_an_mcc172(hz, corner_hz, stated=True)
         assert (np.abs(error) < U).all()
         assert (U < 0.01).all()
@@ -116,7 +116,7 @@ def test_what_the_driver_mcc172_states_agrees_with_both_figures_of_the_data_shee
     assert -0.1 < at_5_2_hz < -0.09
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("corner_hz", [0.1, 0.5, 1.0])
 def test_a_coupling_whose_corner_the_driver_does_not_know_is_in_u(corner_hz: float) -> None:
     options = NiOptions.model_validate({"channels": ["cDAQ1Mod1/ai0"], "iepe_ma": 2.0})

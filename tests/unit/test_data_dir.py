@@ -50,7 +50,7 @@ def test_the_option_and_the_directory_audit_the_same(capsys: pytest.CaptureFixtu
     assert run_cli(["engines", "list", "--data-dir", str(PRESENT)]) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_replay_keeps_a_value_and_its_uncertainty_on_one_line() -> None:
     command = [sys.executable, "-c", "import sys; from agent.cli.main import run_cli; sys.exit(run_cli(sys.argv[1:]))"]
     run = subprocess.run(

@@ -33,7 +33,7 @@ def upper_half(frequency_hz: np.ndarray) -> np.ndarray:  # type: ignore[type-arg
     return np.where(frequency_hz > 10.0, DENSITY, 0.0)
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("disturbed", "times"),
     [
@@ -71,7 +71,7 @@ def test_another_response_is_not_taken_for_noise() -> None:
     assert found.calibration is None
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("to_hz", [30.0, 40.0, 45.0])
 @pytest.mark.parametrize("late_s", [0.0, 0.005])
 def test_motion_that_fills_the_spectrum_is_not_noise(to_hz: float, late_s: float) -> None:

@@ -43,7 +43,7 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert broken == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_comments_cite_pages_that_exist() -> None:
     pages = {page.name for page in PAGES} | {str(page.relative_to(ROOT)) for page in PAGES}
     missing = []

@@ -92,10 +92,12 @@ def writers() -> dict[str, str]:
     return {name: module for module in modules for name in written(module)} | ELSEWHERE
 
 
+@pytest.mark.slow
 def test_every_part_has_a_writer_and_every_writer_a_part() -> None:
     assert set(writers()) == set(parts())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(name for name in parts() if ELSEWHERE.get(name, "benchmarks")))
 def test_the_columns_are_those_that_the_command_writes(name: str) -> None:
     module = writers()[name]
@@ -136,7 +138,7 @@ def assert_same(shown: str, made: str) -> None:
         assert abs(float(old) - float(new)) <= allowed, f"{shown}\n{made}"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_the_guide_says_beforehand() -> None:
     for line in guided.outlooks()[2:]:
         assert_same(line_of("guided", line[: line.index("|", 2) + 1]), line)
@@ -158,7 +160,7 @@ def test_disturbances(monkeypatch: pytest.MonkeyPatch) -> None:
         assert_same(line_of("disturbed", line[: line.index("|", line.index("|", 1) + 1) + 1]), line)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_delay_of_the_drift_test() -> None:
     page = (ROOT / "docs/drift.md").read_text("utf-8")
     for name in ("step of 30 sigma", "step of 3 sigma", "step of 1 sigma", "ramp of 0.05 sigma a window"):

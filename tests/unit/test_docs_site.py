@@ -35,7 +35,7 @@ def test_the_reference_is_that_of_the_code(made: dict[str, str]) -> None:
     assert stale == [], "run `.venv/bin/python -m docs.reference.pages` and commit what it writes"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_reference_names_what_the_code_has(made: dict[str, str]) -> None:
     assert "| `late_horizon_s` | number | s | `5.0` |" in made["configuration.md"]
     assert "| `reference_frequency_hz` | number | Hz | 0 if nothing moved yet |" in made["messages.md"]

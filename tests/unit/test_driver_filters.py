@@ -86,16 +86,22 @@ def test_the_configuration_comes_before_the_driver() -> None:
     assert same(calibrations(config, events(other)), calibrations(config, events({})))
 
 
+LATE = (62.5, 12.0, 0.003)  # by 24 ms
+
+
 @pytest.mark.slow
-def test_s_is_right_beside_the_filters_of_an_adxl355_and_held_where_nobody_states_them() -> None:
-    case = (62.5, 12.0, 0.003)  # 24 ms late
-    found, without = (chip.one((case, kind, chip.SEED)) for kind in ("sensor", "nothing"))
+def test_s_is_right_beside_the_filters_of_an_adxl355() -> None:
+    found = chip.one((LATE, "sensor", chip.SEED))
     assert found.used >= chip.TIMING.windows
     assert not found.held
     assert np.nanmax(np.abs(found.over_u)) < 1.3  # of 12 values, U is two standard uncertainties
     assert np.abs(found.over_u_at_0hz).max() < 1.3
     assert np.abs(found.main).max() < 2e-3
-    assert without.used < chip.TIMING.windows
+
+
+@pytest.mark.thorough
+def test_windows_are_held_where_nobody_states_the_filters_of_an_adxl355() -> None:
+    assert chip.one((LATE, "nothing", chip.SEED)).used < chip.TIMING.windows
 
 
 @pytest.mark.one_case
@@ -131,7 +137,7 @@ def calibrated(path: Path, *options: str) -> list[list[float]]:
     return json.loads(out.read_text())["sensitivity"]  # type: ignore[no-any-return]
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_calibrate_uses_the_corner_in_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     coupled = {**STATED, "reference": ("flat", "highpass corner_hz=0.01 u_corner_pct=30")}
     with_it, without = recorded(tmp_path / "a", coupled), recorded(tmp_path / "b", STATED)

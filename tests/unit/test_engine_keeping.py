@@ -48,6 +48,7 @@ def test_release_with_the_same_id_stays(tmp_path: Path, monkeypatch: pytest.Monk
     assert path.read_bytes() == b"a wheel with other comments"
 
 
+@pytest.mark.slow
 def test_directory_that_cannot_be_written_is_told_and_stops_nothing(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -65,6 +66,7 @@ def test_directory_that_cannot_be_written_is_told_and_stops_nothing(
     assert "its wheel cannot be made: Compression requires" in caplog.messages[-1]
 
 
+@pytest.mark.slow
 def test_disk_that_is_full_is_left_as_it_was(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))

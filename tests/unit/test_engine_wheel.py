@@ -34,7 +34,7 @@ def own() -> bytes:
     return build()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_wheel_is_the_same_from_another_place_at_another_time(own: bytes, tmp_path: Path) -> None:
     for package in ("agent", "calib", "hw"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))

@@ -36,6 +36,7 @@ def u_of(covariance: Array) -> Array:
     return np.sqrt(np.diag(covariance))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("repetitions", [3, 12])
 def test_without_walks_it_is_the_adjustment_of_all_windows(repetitions: int) -> None:
     random = np.random.default_rng(3)
@@ -125,6 +126,7 @@ def test_thinned_records_say_the_same() -> None:
     np.testing.assert_allclose(np.sqrt(now.variance[:12]), u, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_nothing_is_merged_across_a_step() -> None:
     records = many(np.random.default_rng(8), NEWEST + 40, 0.01)
     cut = records[20].day

@@ -48,6 +48,7 @@ def restarted(before: State, now: State, **certificate: object) -> State:
     return now
 
 
+@pytest.mark.slow
 def test_another_order_of_the_temperature_begins_again_with_the_kept_windows_and_loses_nothing() -> None:
     order = TemperatureModel(offset_order=1)
     found = restarted(lived(), fresh(STATED, order))

@@ -42,7 +42,7 @@ def statuses(harm: Harm, seed: int = 1) -> list[StatusChange]:
     return [r for r in results if isinstance(r, StatusChange)]
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("harm", "best", "size", "remedy"),
     [
@@ -70,7 +70,7 @@ def test_the_status_says_what_explains_the_held_windows_best(harm: Harm, best: s
     assert remedy in told.reason
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_mount_that_leans_is_named_for_as_long_as_its_windows_are_held() -> None:
     """A window every nine days. The more the state may have wandered since its last window, the less chi-squared has
     beyond chance; in the end the held windows contradict nothing, but would change Q by more than is allowed. With a

@@ -86,7 +86,7 @@ def uff_sets(path: Path) -> list[tuple[list[str], list[float]]]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_uff_has_each_signal_with_unit_direction_and_times(
     recorded: Path, truth: tuple[np.ndarray, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -267,6 +267,7 @@ def test_plots_are_means_at_the_stated_rate(plots: Path, truth: tuple[np.ndarray
     assert told["U_Qz"] == newest.coverage_factor * newest.standard_uncertainty[11]
 
 
+@pytest.mark.slow
 def test_the_reader_of_ros_2_reads_the_accelerations(plots: Path) -> None:
     with RosBag(plots) as bag:
         assert [column.group for column in bag.columns] == ["/mems/acceleration"] * 4

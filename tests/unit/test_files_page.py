@@ -70,7 +70,7 @@ def write(kind: str, site: Path) -> None:
             writer.write_segment([nptdms.ChannelObject(g, n, x, {"unit_string": u}) for g, n, x, u in channels])
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("line", [line for line in COMMANDS if ".mcap" not in line and ".wav" not in line])
 def test_the_same_s_and_q_from_every_format(line: str, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for suffix, library in NEEDS.items():

@@ -115,6 +115,7 @@ def test_a_sensor_beside_two_references_gets_one_calibration(
     assert json.loads((tmp_path / "out" / "site.json").read_text()) == told
 
 
+@pytest.mark.slow
 def test_the_reference_that_contradicts_the_others_is_named(
     directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -94,7 +94,7 @@ def test_one_bad_file_is_told_and_the_others_have_the_same_bits_with_one_and_two
     assert len(written(tmp_path / "one")) == 4
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_dask_gives_the_same_bits(recordings: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra fleet is not installed")
     (tmp_path / "one").mkdir()
@@ -124,7 +124,7 @@ def test_dask_gives_the_same_bits(recordings: Path, tmp_path: Path) -> None:
     assert written(tmp_path / "one") == written(tmp_path / "dask")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_killed_run_leaves_whole_results_and_no_process_and_goes_on(recordings: Path, tmp_path: Path) -> None:
     many, out = tmp_path / "many", tmp_path / "out"
     many.mkdir()
@@ -192,6 +192,7 @@ def test_a_file_that_ends_its_process_is_refused_alone(
     assert "worker process ended" in told["files"][1]["reasons"][0]
 
 
+@pytest.mark.slow
 def test_a_reference_04_percent_low_makes_s_04_percent_low() -> None:
     """S is indication over acceleration, and the acceleration is indication over the reference's sensitivity. The prior
     of S, 5 %, holds S by a thirtieth."""

@@ -110,7 +110,7 @@ def test_the_sensor_is_named_and_hostile_lines_change_nothing(tmp_path: Path, cl
         assert np.allclose(other["least_detectable_pct"], one["least_detectable_pct"], rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_of_two_sensors_both_are_suspected(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     """z of sensor c indicates 6 % less; U of both must hold it, since nobody knows which one has changed."""
     two = [dict(row) for row in clean if row["sensor"] in "cd"]
@@ -296,7 +296,7 @@ def as_line(result: SelfTestReport, gateway: str) -> dict[str, Any]:
     return dict(msgspec.json.decode(msgspec.json.encode(result)) | {"gateway": gateway})
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_recordings_say_the_same_as_lines(tmp_path: Path, clean: list[dict[str, Any]]) -> None:
     few = [row for row in clean if row["sequence"] < 24 * 3]
     tests = [as_line(self_test(row, row["sequence"]), row["gateway"]) for row in few if row["sequence"] % 24 == 3]

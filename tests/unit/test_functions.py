@@ -9,10 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 RULE = ("--select=PLR0913", "--config=lint.pylint.max-args=6", "--ignore-noqa", "--output-format=json")
 
 
+@pytest.mark.slow
 def test_each_function_with_more_than_six_parameters_has_its_reason() -> None:
     command = [sys.executable, "-m", "ruff", "check", "--no-cache", *RULE, "agent", "calib", "hw", "deploy"]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -80,6 +80,7 @@ def test_a_consumer_that_the_router_does_not_hear_gets_all_results_all_the_same(
     relay.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deaf", [1, 2], ids=["the session for results", "both sessions"])
 def test_a_monitor_that_the_router_does_not_hear_shows_the_gateway_and_its_results(
     site: Site, store: Store, tmp_path: Path, deaf: int

@@ -72,6 +72,7 @@ def plain_reading(marks: str) -> tuple[list[int], int]:
 mostly_triples = st.lists(st.sampled_from(["Xoo"] * 6 + ["X", "o", "Xo", "oo", "Xooo"]), max_size=30).map("".join)
 
 
+@pytest.mark.slow
 @given(mostly_triples)
 def test_triples_as_a_plain_reading_of_the_marks(marks: str) -> None:
     data = b"".join((16 * i + (mark == "X")).to_bytes(3, "big") for i, mark in enumerate(marks))

@@ -44,7 +44,7 @@ def test_one_sample_that_is_taken_is_told_within_two_seconds(rate_hz: float, see
     assert taken_s < t_s < taken_s + 2.0
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("rate_hz", [3.90625, 125.0, 1000.0])
 def test_nothing_is_told_of_a_device_that_drifts_and_a_machine_that_is_late(rate_hz: float) -> None:
     pace, before, count = Pace(rate_hz), 0, 0

@@ -87,6 +87,7 @@ def test_a_plug_in_cannot_take_a_built_in_name(tmp_path: Path, monkeypatch: pyte
     assert driver_names().count("adxl355") == 1
 
 
+@pytest.mark.slow
 def test_naming_drivers_imports_neither_port_library() -> None:
     code = "import sys, hw.sensor; hw.sensor.driver_names(); print({'serial', 'smbus2', 'numpy'} & set(sys.modules))"
     printed = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout

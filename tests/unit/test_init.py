@@ -224,6 +224,7 @@ def test_a_stall_of_the_machine_does_not_change_the_rate() -> None:
     assert heard.counted_hz == pytest.approx(100.0, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "unit"), [(b"0.02,-0.01,1.003", "g"), (b"0.2,-0.1,9.81", "m/s2")])
 def test_a_device_at_rest_tells_its_unit(line: bytes, unit: str, tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"

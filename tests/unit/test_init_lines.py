@@ -171,7 +171,7 @@ def test_stated_lines_are_not_listened_to(tmp_path: Path) -> None:
     assert (options["columns"], options["axes"], options["sequence"]) == (["seq", "a", "-"], 1, True)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_columns_on_a_terminal(tmp_path: Path) -> None:
     path = tmp_path / "gateway.toml"
     with writing(lambda _: f"{REST},23.5\n") as port:

@@ -67,7 +67,7 @@ def assert_found(data: bytes, offset: int, flip: int, span: tuple[int, int]) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", [17, pytest.param(3, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("step", [17, pytest.param(3, marks=pytest.mark.nightly)])
 def test_every_changed_byte_is_found_in_its_record(recording: bytes, step: int) -> None:
     """Those near the begin of a record, which tells its kind and length, or its end; each `step`-th of the others."""
     flips = np.random.default_rng(1).integers(1, 256, len(recording))
@@ -160,6 +160,7 @@ def test_files_written_with_less_are_refused(options: dict[str, Any], reason: st
     assert any(reason in fault.reason for fault in check(out.getvalue()).faults)
 
 
+@pytest.mark.slow
 @given(data=st.binary(min_size=1, max_size=300), at=st.integers(0, 299), flip=st.integers(1, 255))
 def test_the_crc_tells_which_byte_changed(data: bytes, at: int, flip: int) -> None:
     at %= len(data)

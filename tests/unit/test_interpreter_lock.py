@@ -82,6 +82,6 @@ def test_no_thread_of_zenoh_waits_for_the_interpreter_while_a_router_answers(sit
     assert printed(_HEARING, site.endpoint) == "ended\n"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_publishers_are_undeclared_without_the_lock_of_the_interpreter(site: Site, tmp_path: Path) -> None:
     assert printed(_PUBLISHER, site.endpoint, tmp_path) == "True\n"

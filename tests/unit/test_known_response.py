@@ -53,7 +53,7 @@ def drawn(seed: int, order: int, corner_hz: float) -> Filter:
     return lowpass(order, corner_hz * (1.0 + U_CORNER * np.random.default_rng([13, seed]).normal()))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("in_reference", [False, True])
 @pytest.mark.parametrize("order", [2, 4])
 def test_a_stated_filter_of_which_the_corner_is_a_tenth_off(order: int, in_reference: bool) -> None:
@@ -189,6 +189,7 @@ def test_the_table_of_a_certificate(files: tuple[list[str], Pair, Filter], tmp_p
     assert without["valid_band_hz"][1] < told["valid_band_hz"][1]
 
 
+@pytest.mark.slow
 def test_options_win_over_the_certificate(files: tuple[list[str], Pair, Filter], tmp_path: Path) -> None:
     options = files[0]
     path = certificate(tmp_path, lambda f: np.ones(len(f)) + 0j)

@@ -35,7 +35,7 @@ def found(lag_s: float, seed: int, band_hz: tuple[float, float] = (0.5, 12.0), h
     return np.column_stack(minima(*misfit_by_lag(V, expected, sample, RATE_HZ, 0.15)))
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("lag_s", [0.0, 0.0123, -0.0371, 0.1404, -0.1404])
 @pytest.mark.parametrize("holes", [False, True])
 def test_the_deepest_minimum_is_at_the_lag(lag_s: float, holes: bool) -> None:
@@ -76,6 +76,7 @@ def outputs(
 time_of_all_s = np.arange(round(RATE_HZ * SECONDS)) / RATE_HZ
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [0.05, -0.05, 0.01])
 @pytest.mark.parametrize(
     ("off_s", "longest_s"), [((0.0, 10.0), (10.0, 40.0)), ((14.5, 24.5), (24.5, 40.0)), ((31.0, 40.0), (0.0, 31.0))]
@@ -121,7 +122,7 @@ def stretches(number: int, rate: float, lag_s: float, kept: list[weakref.ref[np.
         del V, u
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(("rate", "lag_s"), [(0.0, -0.09), (1.5e-4, 0.05), (-5e-5, 0.0)])
 def test_clocks_that_run_apart_are_found_by_correlation_without_holding_all_samples(rate: float, lag_s: float) -> None:
     kept: list[weakref.ref[np.ndarray]] = []

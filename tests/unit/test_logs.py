@@ -214,7 +214,7 @@ def test_whatever_a_process_tells_on_standard_error_is_json() -> None:
     assert ended.stdout == ""
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_faults_of_a_configuration_are_json_too(tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text("speed = 1\n")

@@ -106,6 +106,7 @@ def test_a_change_is_told_within_a_day_and_nothing_before() -> None:
     assert all("sensitivity of z by -0.5" in sentence for sentence in found[224:])
 
 
+@pytest.mark.slow
 def test_a_change_with_the_temperature_is_told_only_beyond_what_the_temperature_may_do() -> None:
     assert set(told(400, np.array([0.0, 0.0, 0.05]), degrees=(20.0, 30.0), u_per_k=0.01)) == {""}
     assert told(400, np.array([0.0, 0.0, 0.05]), degrees=(20.0, 30.0), u_per_k=1e-4)[-1]

@@ -96,7 +96,7 @@ def test_a_port_that_is_taken_is_told() -> None:
         serve_metrics("127.0.0.1", int(address.split(":")[2].split("/")[0]), lambda: None)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_nothing_of_it_loads_where_it_is_off() -> None:
     program = "import agent.acquisition.service, sys; sys.exit('prometheus_client' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

@@ -62,7 +62,7 @@ def received_from(result: Result, t_utc_ns: int, epoch: str = "", **more: Any) -
     return Received("", address, result.sequence, fields, None, epoch=epoch)
 
 
-@pytest.fixture(params=["SQLite", "PostgreSQL"])
+@pytest.fixture(params=["SQLite", pytest.param("PostgreSQL", marks=pytest.mark.thorough)])
 def kept(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Kept]:
     with closing(engine_of(request, tmp_path)) as engine:
         yield Kept(engine)

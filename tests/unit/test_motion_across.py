@@ -61,9 +61,9 @@ def test_motion_across_is_no_response_over_frequency() -> None:
 @pytest.mark.parametrize("turned", [False, True], ids=["as it stands", "outputs exchanged"])
 def test_response_is_told_as_well_by_the_output_along_the_motion(turned: bool) -> None:
     """Without motion across, the response is told to the same from one output as from three, also where the outputs are
-    other ones than the axes. 20 windows each, U of what they tell within 3 %."""
+    other ones than the axes. 8 windows each, U of what they tell within 3 %."""
     S = S_TRUE[[2, 0, 1]] if turned else S_TRUE
-    for seed in range(20):
+    for seed in range(8):
         bands = band_sums(*moved(seed, 0.0, 0.02, S), RATE_HZ)
         assert bands is not None
         three, one = told(bands), told(along_motion(bands, DIRECTION))
@@ -87,8 +87,8 @@ def test_a_windows_bands_are_those_along_its_motion() -> None:
 @pytest.mark.parametrize("across", [0.0, 0.3])
 def test_calibrate_counts_the_motion_across_that_the_sensor_shows(across: float) -> None:
     """With the default of 1 %: S of a sensor along z, of which the outputs x and y show motion across. What it tells of
-    S is right, and there is a warning; none where nothing moves across. 6 recordings."""
-    for seed in range(6):
+    S is right, and there is a warning; none where nothing moves across. 3 recordings."""
+    for seed in range(3):
         S = np.eye(3) + 0.01 * np.random.default_rng([seed, 1]).standard_normal((3, 3))
         u, _, V = moved(seed, across, 0.01, S, np.array([0.0, 0.0, 1.0]))
         time_s = np.arange(len(u)) / RATE_HZ
@@ -121,8 +121,8 @@ def test_outputs_that_are_copies_are_no_motion_across() -> None:
 @pytest.mark.parametrize("across", [0.5, 1.5])
 def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(across: float) -> None:
     """What it moves across follows what it moves along differently in each octave, by its modes. S is off by 3 % in
-    each element: uncorrected, 1.5 times that would be in S_zz. 6 recordings of two minutes."""
-    for seed in range(6):
+    each element: uncorrected, 1.5 times that would be in S_zz. 3 recordings of two minutes."""
+    for seed in range(3):
         S = np.eye(3) + 0.03 * np.random.default_rng([seed, 1]).standard_normal((3, 3))
         u, _, V = moved(seed, across, 0.01, S, np.array([0.0, 0.0, 1.0]))
         told = beside_one_axis(u, V)
@@ -136,7 +136,7 @@ def test_s_along_the_reference_is_right_where_a_structure_moves_as_much_across(a
 @pytest.mark.slow
 def test_one_mode_alone_tells_s_along_only_as_well_as_transverse_sensitivities_are_known() -> None:
     """x moves half as much as z, and only with it: V_z shows S_zz + 0.5 S_zx."""
-    for seed in range(6):
+    for seed in range(3):
         random = np.random.default_rng([seed, 2])
         S = np.eye(3) + 0.03 * random.standard_normal((3, 3))
         u, _, _ = moved(seed, 0.0, 0.0, S, np.array([0.0, 0.0, 1.0]))
@@ -175,7 +175,7 @@ def test_a_bridge_beside_a_vertical_reference_is_calm_where_its_motion_across_is
     assert u[8] < 0.003
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_motion_across_that_is_not_stated_is_named_and_not_an_inverted_output() -> None:
     reasons = hours(1.0).gateway.reasons
     assert any("moves across the reference" in reason and "transverse_motion_pct to" in reason for reason in reasons)

@@ -285,7 +285,7 @@ def test_what_the_next_tests_are_told_to_do_is_accepted() -> None:
     right(calibrate(*clamped(), nominal=26.0, u_nominal_pct=10.0))
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_uniaxial_reference_in_another_unit_is_found_by_gravity() -> None:
     sensor, (time_s, a), poses = clamped()
     reason = only_reason(calibrate(sensor, (time_s, a / G_MPS2), poses))
@@ -298,9 +298,7 @@ def in_rad(poses: list[dict[str, float]], *names: str) -> list[dict[str, float]]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "names", [("alpha_deg",), pytest.param(("theta_deg", "alpha_deg"), marks=pytest.mark.thorough)]
-)
+@pytest.mark.parametrize("names", [("alpha_deg",), pytest.param(("theta_deg", "alpha_deg"), marks=pytest.mark.nightly)])
 def test_angles_in_rad_are_named(names: tuple[str, ...]) -> None:
     sensor, reference, poses = clamped()
     found = calibrate(sensor, reference, in_rad(poses, *names))
@@ -327,7 +325,7 @@ def test_times_in_ms_are_named_for_the_table_that_has_them() -> None:
     right(of_twenty_seconds())
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(("channel", "times"), [(0, 0.0), (1, 1.0 / 30.0), (2, 0.0)])
 def test_a_dead_channel_of_the_reference_is_named_and_no_output_called_dead(channel: int, times: float) -> None:
     sensor, (t, a) = triad()
@@ -388,7 +386,7 @@ def test_a_nominal_sensitivity_per_g_is_named() -> None:
     assert "all main sensitivities are about 0.102 times what was expected: the prior is per g; convert it" in reason
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_self_test_that_was_left_on_for_some_windows_is_named() -> None:
     (t, V), reference, poses = clamped()
     on = V.copy()

@@ -88,7 +88,7 @@ def test_another_reference_tells_who_has_drifted_if_it_was_there_for_three_quart
     raise AssertionError("nothing was told")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_walks_as_they_are_stated_are_told_at_most_as_often_as_the_formula_says() -> None:
     """3 lives of 8 years at 2 false alarms a year: 48 by the formula, an upper bound. The spans that are kept, and
     daily looks, leave at least a third; 99.9 % of Poisson counts of 16 to 48 are 5 to 73."""

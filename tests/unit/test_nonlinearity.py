@@ -48,6 +48,7 @@ def test_a_sensor_that_slips_where_the_motion_is_strong_is_refused(above: float)
     assert window(u, output(u, 1)).used
 
 
+@pytest.mark.slow
 def test_slips_do_not_hide_in_noise_nor_make_themselves_uncertain() -> None:
     """50 seeds of 20 s, noise a tenth of the motion, slips above twice its rms: all are refused. The strong points
     scatter by their slips; how uncertain their sensitivity is, the moderate points tell."""

@@ -315,6 +315,7 @@ def test_the_figure_shows_s_q_response_and_windows(result: Outcome) -> None:
     assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_neither_matplotlib_nor_pandas_is_needed_until_plot() -> None:
     code = (
         "import sys; sys.modules['matplotlib'] = sys.modules['pandas'] = None\n"
@@ -328,7 +329,7 @@ def test_neither_matplotlib_nor_pandas_is_needed_until_plot() -> None:
     assert run.stdout.splitlines() == ["refused True", told]
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_the_notebook_runs_and_its_outputs_are_those_of_a_run() -> None:
     """Without Jupyter: the code cells run in order in one name space, as docs/images/notebook_run.py does it."""
     notebook = json.loads(NOTEBOOK.read_text("utf-8"))

@@ -28,7 +28,7 @@ def jittery(time_s: Array) -> Array:
     return time_s + np.random.default_rng(5).exponential(3e-4, len(time_s))
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     "stamp_s",
     [
@@ -51,6 +51,7 @@ def test_a_logger_that_is_off_between_stays(stamp_s: Array) -> None:
     assert np.abs(errors(found) / found.expanded_uncertainty).max() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [3, 12000])
 def test_a_clock_that_jumps_from_1970(before: int) -> None:
     """The samples before a time server set the clock are not beside the reference, all others are."""
@@ -121,7 +122,7 @@ def test_stamps_of_whole_milliseconds_are_no_other_rate() -> None:
             assert change_of_rate(stamp_s) is None, (jitter_s, ppm)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_stalls_losses_and_a_slow_clock_are_no_other_rate() -> None:
     random = np.random.default_rng(2)
     t = np.arange(30_000) / 100.0

@@ -45,9 +45,9 @@ def u_of(found: Link) -> np.ndarray:
 
 @pytest.mark.slow
 def test_q_of_a_drifting_sensor_is_that_in_the_middle_and_its_u_covers_both_ends() -> None:
-    """40 meetings. A constant Q would be off by the mean of the walk from the middle, of which the SD is known."""
+    """16 meetings. A constant Q would be off by the mean of the walk from the middle, of which the SD is known."""
     away, ends, u = [], [], []
-    for seed in range(40):
+    for seed in range(16):
         found, walk = met(seed, DRIFT_MPS2)
         away.append(found.mean[9:])
         u.append(u_of(found)[9:])

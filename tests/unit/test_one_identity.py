@@ -74,6 +74,7 @@ def test_after_restarts_it_is_the_calibration_that_was_made() -> None:
     assert (fresh.made, fresh.date_utc_ns) == ((fresh.run_id, fresh.sequence), fresh.t_utc_ns)
 
 
+@pytest.mark.slow
 def test_a_rollback_brings_back_the_calibration_that_was_made() -> None:
     site = begun(site_config())
     first = updates(site.play(3))[-1]
@@ -137,7 +138,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_report_after_a_restart_shows_the_run_in_which_it_was_made(recorded: Path, tmp_path: Path) -> None:
     before = gather([recorded], None)
     directory = tmp_path / "data"

@@ -15,6 +15,7 @@ from tests.unit.mounted_site import Site, begun, said, site_config, updates, win
 FAR = S_TRUE * np.array([1.0, 1.3, 1.0])  # beyond max_change
 
 
+@pytest.mark.slow
 def test_on_hold_nothing_changes_until_it_is_released() -> None:
     site = begun(site_config())
     before = updates(site.play(3))[-1]

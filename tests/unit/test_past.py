@@ -111,6 +111,7 @@ def test_it_is_the_solution_of_one_dense_problem() -> None:
     assert change.found[4] == pytest.approx(0.03 * S_TRUE[1, 1], abs=3.0 * change.standard_uncertainty[4])
 
 
+@pytest.mark.slow
 def test_the_date_of_a_step_is_that_of_the_dense_problem_with_the_step_in_each_gap() -> None:
     """The step, as large as it was found to be, is as likely beforehand at any time; at 1 % it is in doubt."""
     state = filled(1, step=0.01)
@@ -167,6 +168,7 @@ def test_the_date_of_a_found_drift_is_its_onset(every: float, last: float) -> No
     assert 0.1 < date.standard_uncertainty < 0.7
 
 
+@pytest.mark.slow
 def test_the_date_of_a_stated_change_is_between_the_windows_before_and_after_it() -> None:
     state = filled(7)
     state.remount()

@@ -183,7 +183,7 @@ def test_samples_are_corrected_by_the_past_and_name_their_calibration(
     assert set(columns["calibration"].tolist()) == {0, *found.values()}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_stationxml_has_the_channels_of_the_miniseed_of_the_same_recording(
     kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -60,6 +60,7 @@ def test_the_stated_uncertainty_is_the_scatter_of_hours() -> None:
     assert 1.0 < np.sqrt(np.mean(u**2)) / bound < 4.0
 
 
+@pytest.mark.slow
 def test_a_floor_that_doubles_moves_nothing() -> None:
     """White noise of 1.5 times the motion, and twice its power: four hours within 0.3 %, each within 3 u."""
     bands = bands_of(RATE_HZ)

@@ -134,6 +134,7 @@ def played(
     return results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("true_hz", [50.0, 100.0, 200.0])
 def test_a_device_at_half_or_double_its_stated_rate_is_calibrated_all_the_same(true_hz: float) -> None:
     update = [r for r in played(true_hz=true_hz) if isinstance(r, CalibrationUpdate)][-1]

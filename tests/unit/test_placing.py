@@ -118,6 +118,7 @@ def test_angles_of_a_clamp_come_out_of_an_exact_sensor(alpha_deg: float, sign: i
     np.testing.assert_allclose(leant.gravity_mps2, mean.value, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_stated_uncertainty_of_angles_is_their_scatter() -> None:
     """2000 sensors drawn from what is known of them: chi-squared of alpha and theta is 1 each, within 4 SD of it."""
     random, known, pulls = np.random.default_rng(3), knowing((0.01, 0.01, 0.1)), []

@@ -109,7 +109,7 @@ def test_a_user_with_the_right_puts_a_picture_and_sensors(served: Served) -> Non
     assert served.ask("/api/plan", headers=anna).json["positions"] == {}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_others_and_other_pages_change_nothing(served: Served) -> None:
     anna, bob = session(served, "anna"), session(served, "bob")
     before = served.ask("/api/plan", headers=anna).json

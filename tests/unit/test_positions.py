@@ -96,6 +96,7 @@ def test_each_stay_is_one_window_in_the_right_position_a_guard_from_the_turning(
         assert window.numbers["position_chi2"] < 21.2
 
 
+@pytest.mark.slow
 def test_times_of_a_change_are_those_of_the_samples_however_late_they_arrive() -> None:
     values = turned(FACES[:3])
     early, late = windows(values), windows(values, late_s=3.0)
@@ -104,6 +105,7 @@ def test_times_of_a_change_are_those_of_the_samples_however_late_they_arrive() -
     np.testing.assert_allclose([w.stop_s for w in early], [w.stop_s for w in late], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_long_stay_is_cut_into_windows() -> None:
     stay = np.tile(FACES[0] + OFFSET_MPS2, (round(100 * RATE_HZ), 1))
     found = windows(stay, configured(window_s=20))
@@ -111,6 +113,7 @@ def test_a_long_stay_is_cut_into_windows() -> None:
     np.testing.assert_allclose([w.stop_s for w in found], [20.5, 40.5, 60.5, 80.5], atol=TRIMMED_S)
 
 
+@pytest.mark.slow
 def test_a_position_that_nobody_stated_is_unknown_and_its_window_refused() -> None:
     askew = G_MPS2 * np.array([0.6, 0.0, 0.8])
     found = windows(turned([FACES[0], FACES[1], askew, FACES[2], FACES[3]]))
@@ -120,6 +123,7 @@ def test_a_position_that_nobody_stated_is_unknown_and_its_window_refused() -> No
     assert found[2].numbers["position_chi2"] > 21.2
 
 
+@pytest.mark.slow
 def test_what_comes_after_a_slip_is_refused_until_the_sensor_is_turned() -> None:
     slip_rad = np.deg2rad(1.5)
     slipped = G_MPS2 * np.array([np.sin(slip_rad), 0.0, np.cos(slip_rad)])

@@ -189,6 +189,7 @@ def test_without_a_router_results_wait_in_the_outbox_and_leave_in_order(
         subscriber.undeclare()
 
 
+@pytest.mark.slow
 def test_what_a_dying_router_did_not_take_stays_in_the_outbox(site: Site, store: Store, publisher: Publisher) -> None:
     store.commit([record(n) for n in range(1, 20_001)])
     publisher.start()

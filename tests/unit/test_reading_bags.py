@@ -63,6 +63,7 @@ def begins(found: SensorFile) -> int:
 # Cut files
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "share", "least"),
     [
@@ -156,6 +157,7 @@ def test_a_clock_that_was_set_back_is_not_sorted_away(tmp_path: Path) -> None:
     fault(mcap(tmp_path / "a.mcap", made), f"row {N // 2 + 1}, column time_s: .*; time must not decrease, sort or cut")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_ns", [0, 700_000])
 def test_doubled_messages_are_taken_once(late_ns: int, tmp_path: Path) -> None:
     """As after a merge of files that overlap, and as a driver that publishes twice (zed-ros-wrapper issue 577)."""

@@ -113,6 +113,7 @@ def test_sensors(kind: str, tmp_path: Path) -> None:
     assert bool(found.said) == (told or kind == "UTF-16 of Excel" or "decimal commas" in kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", DATED)
 def test_dates(kind: str, tmp_path: Path) -> None:
     found = read_sensor(written(tmp_path, DATED[kind]))
@@ -142,6 +143,7 @@ def test_a_missing_value_is_a_gap(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.time_s[:], VALUES[:, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("header", "unit", "quantity", "options"),
     [
@@ -183,6 +185,7 @@ def test_three_axes_in_g(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.x[:], G * VALUES[:, 1:], rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -250,6 +253,7 @@ def test_as_pandas_writes_it(tmp_path: Path) -> None:
     assert np.isnan(found.v[:][7]).all()
 
 
+@pytest.mark.slow
 def test_gaps_do_not_hide_the_rests(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     random = np.random.default_rng(5)
     towards = random.normal(size=(14, 3))

@@ -66,6 +66,7 @@ def test_a_cell_array_that_announces_too_much_is_refused(tmp_path: Path) -> None
     fault(path, "announces more than it holds; save it with -v7")
 
 
+@pytest.mark.slow
 def test_a_file_that_ends_its_reader_is_told(tmp_path: Path) -> None:
     savemat(tmp_path / "a.mat", MATLAB["vectors"])
     data = bytearray((tmp_path / "a.mat").read_bytes())

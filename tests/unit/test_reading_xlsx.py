@@ -120,7 +120,7 @@ HOSTILE = {
 }  # fmt: skip
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_a_hostile_workbook_ends_in_one_line(kind: str, tmp_path: Path) -> None:
     name, edit, told = HOSTILE[kind]
@@ -133,6 +133,7 @@ def test_a_hostile_workbook_ends_in_one_line(kind: str, tmp_path: Path) -> None:
     assert used.ru_utime - before.ru_utime < 10.0  # s of CPU
 
 
+@pytest.mark.slow
 def test_a_cut_file_and_another_archive(tmp_path: Path) -> None:
     data = book(tmp_path / "a.xlsx", only=[HEAD, *ROWS]).read_bytes()
     (tmp_path / "b.xlsx").write_bytes(data[: len(data) // 2])

@@ -61,8 +61,8 @@ def windows(seed: int, number: int, **more: Any) -> list[Window]:
 
 
 def stepped(found: Estimation, seed: int = 1, **step: Any) -> Estimation:
-    """Ten windows before the step, and the five that confirm it."""
-    assert set(days(found, 0, windows(seed, 10))) == {"take"}
+    """Six windows before the step, and the five that confirm it."""
+    assert set(days(found, 0, windows(seed, 6))) == {"take"}
     assert days(found, 10, windows(seed + 100, 5, **step))[-1] == "adopt"
     return found
 
@@ -81,7 +81,7 @@ def test_after_a_step_of_reference_or_sensor_u_covers_both_and_stays(step: dict[
     assert u == pytest.approx(S_TRUE[1, 1] * abs(shown) / 1.6, rel=0.1)
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1] * (1 + true)) < 2 * u
     assert u_of(found)[[0, 8]].max() < 2e-3  # the channels that did not step
-    assert set(days(found, 15, windows(7, 30, **step))) == {"take"}
+    assert set(days(found, 15, windows(7, 12, **step))) == {"take"}
     assert u_of(found)[SYY] == pytest.approx(u, rel=0.01)
 
 
@@ -109,7 +109,7 @@ def test_another_reference_tells() -> None:
     found.meet("A", "", 1.0)
     stepped(found, reference_error=ALONG_Y)
     found.meet("B", "", 1.0)
-    assert set(days(found, 15, windows(8, 10))) == {"take"}
+    assert set(days(found, 15, windows(8, 6))) == {"take"}
     assert abs(found.in_force.sensitivity[1, 1] - S_TRUE[1, 1]) < 3 * u_of(found)[SYY] < 6e-3
 
 

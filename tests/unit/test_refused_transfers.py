@@ -104,7 +104,7 @@ def test_run_ends_with_2_where_no_channel_can_work(tmp_path: Path) -> None:
     assert fieldcal("audit", file).returncode == 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.usefixtures("plug_in")
 def test_the_others_go_on_where_a_channel_can_work(tmp_path: Path) -> None:
     done = ran(tmp_path, ["imu", "good"], "the adapter refuses", times=10**9, duration_s=4)

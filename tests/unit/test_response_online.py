@@ -20,7 +20,7 @@ from hw.virtual.building import Building
 from hw.virtual.building_motion import BuildingSpectrum
 from tests.pair import Filter, both, flat, highpass, lowpass, moving_mean, resonance
 
-SEED, WINDOWS = 1, 8
+SEED, WINDOWS = 1, 6
 BROAD = BuildingSpectrum(0.5, 12.0)
 FILTERS = {
     "flat": flat,
@@ -69,7 +69,7 @@ def deviation_pct(one: CalibrationUpdate, other: Array) -> float:
     return float(100.0 * np.abs(np.array(one.sensitivity) - other).max())
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("name", [name for name in FILTERS if name != "flat"])
 def test_a_filter_changes_neither_s_at_its_frequency_nor_q(name):
     found, without = told(name), told("flat")
@@ -89,7 +89,7 @@ def test_a_filter_of_the_reference_acts_the_other_way():
     assert deviation_pct(found, np.array(without.sensitivity) / size(name, found)) < SAME_PCT
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("name", list(FILTERS))
 def test_the_response_is_told_by_frequency(name):
     found = told(name)

@@ -24,7 +24,7 @@ print(*sorted(sys.modules))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_core_and_the_library_load_no_input_or_output() -> None:
     run = subprocess.run([sys.executable, "-c", WALK], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = run.stdout.split()
@@ -33,7 +33,7 @@ def test_the_core_and_the_library_load_no_input_or_output() -> None:
     assert [name for name in loaded if name.partition(".")[0] in FORBIDDEN] == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_no_text_of_the_library_names_an_option_a_command_or_a_setting_of_the_agent() -> None:
     """Names in `...` are arguments of functions; the command line writes them as its options."""
     settings = [rf"\b{section}\.{field}\b" for section, of in Knowledge.model_fields.items()
@@ -49,7 +49,7 @@ def test_no_text_of_the_library_names_an_option_a_command_or_a_setting_of_the_ag
     assert found == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_loads_neither_virtual_worlds_nor_what_is_done_at_a_desk() -> None:
     """Beside them, `fieldcal run` asks once, before devices open, what stated positions determine (agent.bench)."""
     code = "import sys, agent.cli.run, agent.acquisition.service, agent.recording.device\nprint(*sorted(sys.modules))"
@@ -65,7 +65,7 @@ def test_a_run_loads_neither_virtual_worlds_nor_what_is_done_at_a_desk() -> None
     assert [name for name in loaded if desk.match(name)] == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_run_loads_nothing_while_devices_are_read() -> None:
     """What numpy loads at the first use of a function costs memory, and time in which no device is read."""
     code = (

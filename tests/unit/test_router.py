@@ -109,7 +109,7 @@ def test_a_configuration_file_is_used_and_its_faults_are_one_line(tmp_path: Path
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -115,7 +115,7 @@ def test_sensitivity_and_orientation_of_a_seismometer(
     assert not other.comments
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_accelerometer_beside_a_seismometer_feels_gravity(site: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found, _ = calibrated(site, "ACC", capsys)
     told = {each["channel"].rpartition(".")[2]: each for each in found["station"]}
@@ -185,6 +185,7 @@ def test_metadata_are_for_miniseed(tmp_path: Path) -> None:
         read_reference(tmp_path / "a.csv", described=Description(tmp_path / "b.xml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "message"),
     [

@@ -214,6 +214,7 @@ def test_a_device_that_goes_away_meanwhile_is_told_and_opened_again() -> None:
     assert report(failed).reason == failed.message
 
 
+@pytest.mark.slow
 def test_the_response_and_its_uncertainty() -> None:
     rng = np.random.default_rng(3)
     responses, u2 = [], []

@@ -147,6 +147,7 @@ def test_u_is_at_its_bound_whichever_windows_have_faster_motion(order: str) -> N
     assert over_u < 0.3  # the reference is right, and u is its own
 
 
+@pytest.mark.slow
 def test_the_frequency_is_settled_by_the_second_window_and_stays() -> None:
     state, found = after([]), list[float]()
     for k, kind in enumerate("W..WW"):
@@ -186,6 +187,7 @@ def test_what_was_settled_is_told() -> None:
     assert "2 windows have this band in common, and may still change it" in second.settled_since(first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [1, 3])
 def test_a_restored_state_settles_the_same(cut: int) -> None:
     windows = [window(50 + k, kind) for k, kind in enumerate("W..W.")]

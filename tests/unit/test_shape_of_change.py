@@ -59,6 +59,7 @@ def test_all_outputs() -> None:
     assert float(found[1]) == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.slow
 def test_what_is_none_of_these_is_not_called_one() -> None:
     assert said(np.array([[0.0, 0.0, 0.01], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])) == ""
     assert said(np.zeros((3, 3))) == ""

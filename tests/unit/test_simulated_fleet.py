@@ -45,7 +45,7 @@ def consumer_of(site: Site, fleet: SimulatedFleet, directory: Path) -> Iterator[
         yield consumer
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
     site = Site()
     with SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet:
@@ -55,7 +55,7 @@ def test_a_fleet_goes_on_while_the_router_is_away(tmp_path: Path) -> None:
         assert fleet.step(T_NS + DAY_NS) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_every_result_arrives_once_in_order_and_signed_and_forged_ones_are_refused(site: Site, tmp_path: Path) -> None:
     with (
         SimulatedFleet(FleetPlan(4, 1, 1, [site.endpoint], tmp_path)) as fleet,
@@ -119,7 +119,7 @@ def told(behaviour: Behaviour) -> tuple[list[Result], dict[str, Any]]:
     return results, sensor.truth()
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("behaviour", "statuses"),
     [("sound", SOUND), ("drifting", SOUND), ("stepped", [*SOUND, "HELD", "RECALIBRATING"]), ("held", [*SOUND, "HELD"]),
@@ -144,7 +144,8 @@ def test_s_is_near_its_nominal_value_until_it_changes(behaviour: Behaviour) -> N
     np.testing.assert_allclose(truth.sensitivity / NOMINAL, np.eye(3), atol=0.1)
 
 
-@pytest.mark.one_case
+@pytest.mark.thorough
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("behaviour", "verdict"), [("drifting", "drifting"), ("stepped", "stepped"), ("held", "stepped")]
 )
@@ -179,7 +180,9 @@ def test_the_page_reads_what_the_agent_says_of_held_windows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("behaviour", ["sound", pytest.param("drifting", marks=pytest.mark.thorough), "stepped"])
+@pytest.mark.parametrize(
+    "behaviour", ["sound", *(pytest.param(other, marks=pytest.mark.thorough) for other in ("drifting", "stepped"))]
+)
 def test_u_covers_the_truth(behaviour: Behaviour) -> None:
     results, truth = told(behaviour)
     last = [r for r in results if isinstance(r, CalibrationUpdate)][-1]
@@ -302,7 +305,7 @@ def test_gateways_make_their_results_one_after_the_other(site: Site, tmp_path: P
         assert sorted(times.values()) == [k * 100_000_000 for k in range(5)]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_process_that_ends_is_told(site: Site, tmp_path: Path) -> None:
     with FleetProcesses(FleetPlan(2, 1, 1, [site.endpoint], tmp_path)) as fleet:
         os.kill(fleet.pids()[0], signal.SIGKILL)

@@ -20,7 +20,7 @@ def bound(tau: np.ndarray, f: float, phase: float) -> np.ndarray:
     return NOISE * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))[:3]
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("cycles", "per_cycle", "fits"),
     [(1, 333.33, 400), (1.3, 333.33, 400), (2.5, 100, 400), (6, 333.33, 300), (10.7, 166.67, 300), (100.37, 20, 200),

@@ -97,6 +97,7 @@ def test_sound_frequencies_follow_the_temperature_and_are_not_told() -> None:
     assert [len(after(40, seed=seed).frequencies) for seed in range(2)] == [0, 0]
 
 
+@pytest.mark.slow
 def test_what_one_sensor_sees_alone_is_not_the_structure() -> None:
     assert not after(20, in_window(2, 0.05, slice(0, 1))).frequencies
     assert not after(20, in_window(2, 0.05, slice(0, 2))).frequencies
@@ -115,7 +116,7 @@ def test_a_frequency_that_fewer_than_three_sensors_see_is_not_told(see: int) -> 
     assert len(result(watch).frequencies) == (see >= 3)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_sensors_that_see_another_mode_in_the_window_do_not_hide_the_change() -> None:
     """Of six, four see a mode that falls by 2 %, and two another one 9 % below it that stays."""
     site, watch = Frequencies(7), SiteWatch(GATEWAY, BANDS_HZ)
@@ -137,7 +138,7 @@ def test_what_bands_do_since_a_frequency_has_changed_is_told_of_no_sensor() -> N
     assert [one.kind for one in found.sensors] == ["none"] * N
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_sensor_that_changes_at_another_time_is_still_named() -> None:
     site, watch = fifty_days()
     shift = np.zeros((N, len(BANDS_HZ), 3))
@@ -149,7 +150,7 @@ def test_a_sensor_that_changes_at_another_time_is_still_named() -> None:
     assert found.least_detectable[0, 0] > after(40).least_detectable[0, 0], "two bands do not count"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_visit_does_not_touch_frequencies() -> None:
     site, watch = Frequencies(3), SiteWatch(GATEWAY, BANDS_HZ)
     for k in range(60):

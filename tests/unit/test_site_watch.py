@@ -263,7 +263,7 @@ def test_of_two_sensors_it_is_not_told_which_one_has_changed(gateway: list[int])
     assert kinds(turn) == {1: "turn"}
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_the_false_alarms_of_two_sensors_are_those_of_one_comparison() -> None:
     """The statistic of two sound sensors is a standard normal deviate, or less: over 16 sites its root mean square is
     at most 1.1. Were the scatter of their difference taken for half of it, as the level would have it, it were 1.28."""
@@ -396,6 +396,7 @@ def test_the_limit_grows_with_the_number_of_tests() -> None:
         assert limit_of(sensors, gateways) == pytest.approx(NormalDist().inv_cdf(1.0 - 0.25 / (1000.0 * tests)))
 
 
+@pytest.mark.slow
 def test_a_watch_goes_on_from_its_snapshot_bit_for_bit() -> None:
     site = Site(7)
     watch = watched(site, 40)
@@ -631,6 +632,7 @@ def test_a_visit_of_a_gateway_that_was_told_finds_its_change_not_a_common_one(
     assert watch.visits[:, VISIT.index("suspected")].tolist() == [1, 1, 1]
 
 
+@pytest.mark.slow
 def test_gravity_is_asked_at_the_date_of_the_change(learned: tuple[Site, SiteWatch]) -> None:
     """z of sensor 4 loses 3 %, gravity with it; of sensor 6 it loses 3 % too, which gravity does not share."""
     site, watch, change = copy.deepcopy(learned[0]), SiteWatch.loaded(learned[1].snapshot()), np.zeros((9, 6))
@@ -653,6 +655,7 @@ def test_gravity_is_asked_at_the_date_of_the_change(learned: tuple[Site, SiteWat
     assert says[0]["noise"].says == "silent"
 
 
+@pytest.mark.slow
 def test_the_self_test_is_asked_at_the_date_of_the_change_at_the_temperature_of_its_nights(
     learned: tuple[Site, SiteWatch],
 ) -> None:

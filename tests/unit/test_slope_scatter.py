@@ -22,7 +22,7 @@ RATE_HZ, SECONDS, NOISE = 200.0, 8.0, 0.01
 FREQUENCIES_HZ = np.array([1.3, 2.9, 4.7, 7.1])
 S_TRUE = np.array([[1.02, 0.01, -0.02], [0.015, 0.98, 0.005], [-0.01, 0.02, 1.01]])
 Q_TRUE = np.array([0.3, -0.1, 0.2])
-DRAWS, SEED = 20, 35
+DRAWS, SEED = 10, 35
 # Angles are drawn with these, and little else is uncertain: what a wrong weight costs then shows.
 PRIORS = Priors(
     angle_rad=2e-3,
@@ -90,7 +90,9 @@ def mean_square(found: list[Adjustment]) -> Array:
 @pytest.mark.parametrize("jitter_s", [100e-6, 0.0])
 def test_s_and_q_are_as_uncertain_as_said(jitter_s: float) -> None:
     highest = chi2_quantile(1.0 - 1e-3 / 12 / 2, DRAWS) / DRAWS  # 99.9 %, Bonferroni over 12 parameters and 2 sizes
-    assert mean_square(as_they_are(jitter_s)).max() < highest
+    found = mean_square(as_they_are(jitter_s))
+    assert found.max() < highest
+    assert found.mean() < 1.5  # of all twelve together, 1.07 where the lag differs: a variance of 1.5 is seen
 
 
 @pytest.mark.thorough

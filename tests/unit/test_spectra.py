@@ -47,7 +47,7 @@ def test_power_and_cross_power_of_white_noise() -> None:
     assert (allowed < 0.25 * np.append(own, covariance.diagonal())).all()
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 12])
 def test_few_segments_have_no_other_mean_than_many(count: int) -> None:
     """The lowest band, whose lines are the fewest: 4000 hours of `count` segments, seed 2, within 3 %."""

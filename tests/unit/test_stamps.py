@@ -18,6 +18,7 @@ AGE = np.repeat(NEWEST, np.diff(NEWEST, prepend=-1)) - np.arange(len(TRUE))
 RNG = np.random.default_rng(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stamps", "kind", "limit_s"),
     [

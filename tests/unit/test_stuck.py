@@ -50,7 +50,7 @@ def told(results: list[Result]) -> list[tuple[float, str]]:
     return [((change.t_utc_ns - EPOCH_NS) * 1e-9, change.reason) for change in changes]
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("coarse", "change", "since_s", "words"),
     [
@@ -78,6 +78,7 @@ def test_a_stuck_output_is_told_and_never_calibrated(
     assert not any("fieldcal command accept" in r.reason for r in results if isinstance(r, StatusChange))
 
 
+@pytest.mark.slow
 def test_all_outputs_are_told() -> None:
     made = recording(coarse=False)
     held([0, 1, 2])(made.sensor_s, made.V)
@@ -121,6 +122,7 @@ def marked(x: Array) -> NDArray[np.bool_]:
     return np.array([suspect for _, suspect in watched(x)])
 
 
+@pytest.mark.slow
 def test_bursts_that_a_driver_gives_twice_are_told() -> None:
     x = np.random.default_rng(1).normal(size=(12_000, 3)).round(2)
     assert fed(x) == []

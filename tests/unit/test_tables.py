@@ -31,6 +31,7 @@ def body(rows: np.ndarray, form: str = "%.6f") -> str:
     return "".join(",".join(form % x for x in row) + "\n" for row in rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["%.6f", "%.17g", "%.9e", " %.6f "])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.parametrize("tail", ["", "\n\n", "cut"])

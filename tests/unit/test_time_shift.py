@@ -94,7 +94,7 @@ def off_u(drawn: Node, results: list[Result]) -> float:
     return float(np.max(np.abs(error) / update.standard_uncertainty))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("device", "shift_s", "said"),
     [
@@ -154,7 +154,7 @@ def test_a_lag_that_was_excluded_is_seldom_tried_again_but_another_one_at_once(m
     assert tried == [True, True, False, True, True]  # at one lag the first, the second and the fourth; then another
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_device_that_began_anew_is_named() -> None:
     drawn = site()
     results = fed(drawn, shifted(drawn, "reference", 0.015, BlockFlags.RESTART))

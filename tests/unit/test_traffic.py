@@ -31,7 +31,7 @@ def test_a_firm_sensor_behind_a_filter_is_taken_beside_traffic(seed: int) -> Non
     assert found.numbers["nonlinearity_pct"] < 0.5  # of the filter: 3 to 28 % in the band of the shocks
 
 
-@pytest.mark.slow
+@pytest.mark.one_case
 @pytest.mark.parametrize("shocks", [0, 10], ids=["alone", "beside traffic"])
 @pytest.mark.parametrize("fault", [partial(slips, 0.8), partial(slips, 2.5), partial(rattles, 10.0)])
 def test_a_loose_sensor_is_refused_beside_traffic_as_well(fault: Fault, shocks: int) -> None:

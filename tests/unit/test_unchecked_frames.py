@@ -103,6 +103,7 @@ def test_a_counter_rises_evenly() -> None:
     assert list(map(bytes, found.frames)) == frames[2:89]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [COUNTED, CLOSED | COUNTED])
 def test_two_halves_of_different_frames_are_no_sample(changes: dict[str, Any]) -> None:
     """Bytes were lost until the same byte of a later frame: start and end fit. The counter, which is behind the other
@@ -141,7 +142,7 @@ def damaged(frames: list[bytes], k: int, kind: str) -> Iterator[bytes]:
             yield from (whole[:i] + bytes([octet]) + whole[i:] for octet in (0x80, 0x0D, 0, 255, whole[i]))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("kind", ["cut", "lost", "added"])
 @pytest.mark.parametrize("changes", [CLOSED, COUNTED, CLOSED | COUNTED])
 def test_the_way_is_found_within_two_frames(changes: dict[str, Any], kind: str) -> None:
@@ -155,7 +156,7 @@ def test_the_way_is_found_within_two_frames(changes: dict[str, Any], kind: str) 
         assert set(lost) <= set(range(before, 20 + behind))
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize("kind", ["cut", "lost", "added", "flipped"])
 @pytest.mark.parametrize("name", ["sum16", "fletcher16"])
 def test_a_checksum_lets_no_damaged_frame_through(name: str, kind: str) -> None:

@@ -50,7 +50,7 @@ def turned_by_hand(response: Filter, shaken_mps2: float, one_in: int, **stated: 
 STATED = {"sensor_filter": "lowpass order=2 corner_hz=9", "reference_filter": "flat"}
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("response", "stated", "shaken_mps2", "one_in"),
     [
@@ -73,7 +73,7 @@ def test_s_at_0_hz_is_told_by_rests_alone(
     assert "S holds at 0 Hz, told by rests alone" in found.where_it_holds
 
 
-@pytest.mark.one_case
+@pytest.mark.two_cases
 @pytest.mark.parametrize(
     ("response", "shaken_mps2"),
     [
@@ -95,7 +95,7 @@ def test_one_tone_in_all_stays_tells_s_at_its_frequency(response: Filter, shaken
     assert np.all(away < 4.0 * found.standard_uncertainty[:9])
 
 
-@pytest.mark.thorough
+@pytest.mark.nightly
 def test_a_reversed_reference_is_no_lag_of_half_a_period() -> None:
     """Half a period later, a tone of the other sign fits as well: what is refused for its sign stays refused."""
     random = np.random.default_rng(16)
@@ -157,6 +157,7 @@ def tones(u_reference_pct: float, **stated: Any) -> Outcome:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("u_reference_pct", [0.1, 0.5])
 def test_the_band_in_which_s_is_right_is_judged_for_each_element(u_reference_pct: float) -> None:
     """u of a transverse element decided on the main ones: "from 3.49 to 3.78 Hz" excluded the motion that was used."""
@@ -197,6 +198,7 @@ def weak(known: KnownResponse) -> tuple[Pair, Outcome]:
     return made, adjusted(made.files, stated.beside_known(known) if known.is_stated else stated)
 
 
+@pytest.mark.slow
 def test_a_response_that_noise_makes_up_is_refused_with_a_remedy_that_works() -> None:
     """Terms of the response up to ten times what filters have; with none left to the data S is right."""
     _, found = weak(UNKNOWN)
