@@ -307,7 +307,7 @@ def _clocks(watch: SiteWatch, sensors: list[SensorVerdict]) -> None:
 
 def _excited(watch: SiteWatch, tests: Tests, i: int, told: SensorVerdict, limit: float) -> SensorVerdict:
     """What sensor `i` is told of; or that it is excited otherwise, where quiet and loud hours differ by another amount
-    since then, on an axis that is told. A sensitivity changes all hours alike, and damage nearly so."""
+    since then, on any axis. A sensitivity changes all hours alike, and damage nearly so."""
     if told.kind not in ("sensitivity", "one of two", "sensor or structure"):
         return told
     begins = watch.contrasts.begins
@@ -316,9 +316,7 @@ def _excited(watch: SiteWatch, tests: Tests, i: int, told: SensorVerdict, limit:
     at = tests.begins.index(told.since)
     rest, info = tests.joint.rest[at, i, :, :3], tests.joint.information[at, i, :, :3]
     size = np.sqrt(np.sum(info * np.square(rest), axis=0) / np.maximum(info.sum(axis=0), 1e-300))
-    told_axes = np.ones(3) if told.direction < 0 else DIRECTIONS[told.direction, :3]
-    z = np.where(np.abs(step) > PART_CONTRASTED * size, np.abs(step) / u, 0.0) * told_axes
-    z = z.max(axis=1)
+    z = np.where(np.abs(step) > PART_CONTRASTED * size, np.abs(step) / u, 0.0).max(axis=1)
     if z.max() <= limit:
         return told
     best, dates = dated([begins[k] for k in which], np.square(z))

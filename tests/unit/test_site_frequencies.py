@@ -230,7 +230,8 @@ def test_sensors_whose_bands_differ_say_nothing_of_their_gateway() -> None:
     size[:, 2] = 0.02
     none = np.zeros((1, N, 1, 6))
     factor, pair = np.ones((1, 1, len(DIRECTIONS))), np.zeros(1, dtype=bool)
-    joint = JointChange(size, np.full_like(size, 0.002), none, none, none[..., None], size / 0.002, factor, pair)
+    left, freedom = np.zeros((1, N)), np.zeros((1, N), dtype=int)
+    joint = JointChange(size, np.full_like(size, 0.002), none, none, size / 0.002, factor, pair, left, freedom)
     assert _means(joint, GATEWAY, there)[0][0] == pytest.approx([0.0, 0.01, 0.0])
     there[2] = False
     mean, u, fits = _means(joint, GATEWAY, there)
