@@ -232,7 +232,7 @@ def _spread(rest: Array, information: Array, squares: Array, freedom: NDArray[np
     turn = [np.repeat(each[..., None], 3, axis=-1) for each in (squares, freedom)]
     left = np.concatenate([own, turn[0]], axis=-1)
     f = np.maximum(np.concatenate([number - 1, turn[1]], axis=-1), 0)
-    return np.maximum((PRIOR_BANDS * inflation + left) / (PRIOR_BANDS + f), inflation)
+    return np.asarray(np.maximum((PRIOR_BANDS * inflation + left) / (PRIOR_BANDS + f), inflation))
 
 
 def _scatter_of_all(statistic: Array) -> Array:
