@@ -47,6 +47,7 @@ UNSEEN_H, LAG_H = 72.0, 12.0  # time constants: of what moves frequencies unseen
 FREEZING = 3.0  # times as much as above do frequencies move below 0 °C
 U_TOLD_NOISE = 0.05
 GRID = 1.0 / 115.0  # third octaves, from point to point of a spectrum: 0.2 %
+EXCITATIONS = "lane", "diversion", "speed", "works", "factory", "pumps"
 LINE_HZ = 0.012  # half the width of a line of a minute under Hann's window
 
 
@@ -83,6 +84,28 @@ class Damage:
 
 
 @dataclass
+class Excitation:
+    """From `day` on the structure is excited otherwise; itself it has not changed.
+
+    `traffic` (10,): the load that the traffic puts on each mode, over what it was. `rhythm` (24,): what is added to the
+    log amplitude of the traffic in each hour of a day. `source` (10,): load that a source at one place puts on each
+    mode in the hours in which it runs, over that of the traffic at level one. `near` (sensors, bands, 3): root of the
+    power of the motion around the source that no mode has. `runs` (7, 24): in which hours of the week the source runs.
+    """
+
+    day: int
+    traffic: Array
+    rhythm: Array
+    source: Array
+    near: Array
+    runs: NDArray[np.bool_]
+
+    def at(self, day: int) -> NDArray[np.bool_]:
+        """In which hours of a day the source runs, (24,)."""
+        return np.asarray(self.runs[day % 7] & (day >= self.day))
+
+
+@dataclass
 class Bridge:
     """A site with its sensors. `days(n)` gives n days of hours; each call goes on."""
 
@@ -91,13 +114,14 @@ class Bridge:
     gateways: int
     world: World = field(default_factory=World)
     damage: Damage | None = None
+    excitation: Excitation | None = None
 
     def __post_init__(self) -> None:
         self.random = random = np.random.default_rng(self.seed)
         n, m = self.sensors, len(FREQUENCY_HZ)
         self.gateway: NDArray[Any] = np.arange(n) * self.gateways // n
         self.clock_h = random.uniform(-1.0, 1.0, self.gateways) * (2.0 / 60.0)
-        place = (np.arange(n) + random.uniform(0.2, 0.8, n)) / n * 0.94 + 0.03
+        self.place = place = (np.arange(n) + random.uniform(0.2, 0.8, n)) / n * 0.94 + 0.03
         side = np.where(np.arange(n) % 2, 1.0, -1.0)
         self.shape = self._shapes(place, side)
         # Shapes move with the temperature smoothly along the bridge, for each mode and direction otherwise.
@@ -190,7 +214,7 @@ class Bridge:
         cross = np.empty_like(power)
         away = (degc[:PER_DAY] - TEMPERATURE_DEGC) / SPAN_K
         shapes = self._moved_shapes(float(away.mean()), day)
-        load, moved = self._loads(wind, traffic), self._moved(degc, traffic, day)
+        load, moved = self._loads(wind, traffic, day), self._moved(degc, traffic, day)
         root = self._modal_root(load, moved)  # (24, gateways, bands, modes)
         scatter = self._scatter()
         for b, modes in enumerate(self.strongest):
@@ -201,6 +225,10 @@ class Bridge:
             for k, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
                 into = power if k < 3 else cross
                 into[:, :, b, k % 3] = (mixed[:, :, i] * part[:, :, j]).sum(axis=-1) * factor[..., i] * factor[..., j]
+        if self.excitation is not None:
+            near, runs = self.excitation.near, self.excitation.at(day)[:, None, None, None]
+            power += runs * np.square(near)
+            cross += runs * near[..., [0, 0, 1]] * near[..., [1, 2, 2]]
         freedom = self.width_hz[:, None] * 3600.0
         floor = (self.noise[None, :, None, :] * self.width_hz[:, None]).astype(np.float32)
         between = np.sqrt(power[..., [0, 0, 1]] * floor[..., [1, 2, 2]] / (2.0 * freedom))
@@ -223,12 +251,18 @@ class Bridge:
         symmetric = (raw + raw.transpose(0, 2, 1)) / np.sqrt(2.0)  # variance 1 off the diagonal, 2 on it
         return np.eye(len(modes)) + symmetric / np.sqrt(2.0 * freedom)
 
-    def _loads(self, wind: Array, traffic: Array) -> Array:
+    def _loads(self, wind: Array, traffic: Array, day: int) -> Array:
         """(24, gateways, modes), as the clock of each gateway cuts the hours."""
         at = np.arange(PER_DAY)[:, None] + 0.5 + self.clock_h
         hours = np.arange(PER_DAY + 1.0)
+        by_traffic, by_source = self.traffic, np.zeros((PER_DAY, 1, 1))
+        if self.excitation is not None and day >= self.excitation.day:
+            traffic = traffic + np.append(self.excitation.rhythm, self.excitation.rhythm[:1])
+            by_traffic = self.traffic * self.excitation.traffic
+            by_source = self.excitation.at(day)[:, None, None] * self.traffic * self.excitation.source
         return np.asarray(self.wind * np.exp(2.0 * np.interp(at, hours, wind))[..., None]
-                          + self.traffic * np.exp(2.0 * np.interp(at, hours, traffic))[..., None])  # fmt: skip
+                          + by_traffic * np.exp(2.0 * np.interp(at, hours, traffic))[..., None]
+                          + by_source)  # fmt: skip
 
     def _moved(self, degc: Array, traffic: Array, day: int) -> Array:
         """(24, modes): by how much each frequency is higher in each hour than at TEMPERATURE_DEGC."""
@@ -302,6 +336,47 @@ class Bridge:
         out, _ = lfilter([1.0], [1.0, -keep], raw, axis=0, zi=keep * self.state[None])
         self.state = out[-1]
         return self.world.scatter * np.sqrt(len(BANDS_HZ)) * np.asarray(out)
+
+
+def otherwise(bridge: Bridge, kind: str, day: int, random: np.random.Generator) -> Excitation:
+    """A change of the excitation from `day` on, of one of the kinds EXCITATIONS.
+
+    Of a lane that is closed the traffic turns the bridge more, or less; of a diversion there is less traffic, or more,
+    and heavier vehicles; another speed moves its spectrum. Works, a factory and pumps are sources at one place: modes
+    that move there are excited, and the motion around it decays along the bridge. Works run by day and on five days,
+    a factory at night, pumps always and in a few bands.
+    """
+    modes, bands = len(FREQUENCY_HZ), len(BANDS_HZ)
+    traffic = 10.0 ** random.normal(0.0, 0.05, modes)
+    rhythm, source = np.zeros(PER_DAY), np.zeros(modes)
+    near, runs = np.zeros((bridge.sensors, bands, 3)), np.zeros((7, PER_DAY), dtype=bool)
+    if kind == "lane":
+        parts = {"t": random.uniform(0.25, 4.0), "y": random.uniform(0.5, 2.0), "z": random.uniform(0.7, 1.4), "x": 1.0}
+        traffic *= [parts[direction] for direction in DIRECTION]
+    elif kind == "diversion":
+        traffic *= random.choice([0.1, 0.3, 0.5, 2.0, 3.0]) * (FREQUENCY_HZ / 4.0) ** random.uniform(-0.3, 0.3)
+        rhythm = random.uniform(-0.4, 0.4) * np.cos(2.0 * np.pi * (np.arange(PER_DAY) - 12.0) / 24.0)
+    elif kind == "speed":
+        traffic *= (FREQUENCY_HZ / 4.0) ** (random.choice([-1.0, 1.0]) * random.uniform(0.4, 1.0))
+    else:
+        traffic = np.ones(modes)
+        place, strength = random.uniform(0.1, 0.9), 10.0 ** random.uniform(-1.0, 0.3)
+        spectrum = 10.0 ** random.normal(0.0, 0.3, bands)
+        if kind == "pumps":
+            spectrum[random.permutation(bands)[random.integers(1, 4) :]] = 0.0
+        moves = np.square(np.sin(np.pi * HALF_WAVES * place))
+        of = [{"z": 1.0, "t": 0.5, "y": 0.1, "x": 0.05}[direction] for direction in DIRECTION]
+        own = np.abs(np.log(FREQUENCY_HZ[:, None] / BANDS_HZ)).argmin(axis=1)  # the band of each mode
+        source = strength * moves * of * spectrum[own]
+        usual = np.einsum("nam,mb->nba", bridge.shape**2, np.exp(bridge.log_power[:, :, 32]) * bridge.traffic[:, None])
+        reach = np.exp(-np.abs(bridge.place - place) / random.uniform(0.03, 0.15))
+        push = random.normal(size=3) * [0.3, 0.5, 1.0]
+        near = np.sqrt(strength * spectrum * np.median(usual, axis=(0, 2)))[:, None] * reach[:, None, None] * push
+        hours = np.arange(PER_DAY)
+        by_day, by_night = (hours >= 7) & (hours < 17), (hours >= 22) | (hours < 6)
+        runs[:] = {"works": by_day, "factory": by_night, "pumps": hours >= 0}[kind]
+        runs[5:] &= kind != "works"
+    return Excitation(day, traffic, rhythm, source, near, runs)
 
 
 def changed(

@@ -2,6 +2,7 @@
 
     python -m benchmarks.site_watch --sensors 8 [--cases 160] [--write]
     python -m benchmarks.site_watch --sensors 8 --years 60 [--write]
+    python -m benchmarks.site_watch --traffic [--cases 80] [--write]
     python -m benchmarks.site_watch --worlds [--write]
     python -m benchmarks.site_watch --cost [--write]
     python -m benchmarks.site_watch --kept [--write]
@@ -10,10 +11,10 @@
 The bridge is simulated by benchmarks/beam_world.py, whose model is not the estimator's. A site learns for
 LEARNED_DAYS, each from another season on. Then each case changes one sensor (each in turn; every second case one axis
 alone), two at once, a gateway, or the structure. A case is looked at on the day that its mark names, damage on
-several days. Sound sites run for two years each and are looked at once a week; an alarm that was there four weeks
-before is the same one. `--kept` puts the hours of some days into a database of the monitor and repeats the days for a
-year; the monitor then watches the site from its days. `--minutes` ends it early: the table then has fewer cases, and
-says how many.
+several days. `--traffic` draws changes of what moves the structure, of six kinds in turn. Sound sites run for two
+years each and are looked at once a week; an alarm that was there four weeks before is the same one. `--kept` puts the
+hours of some days into a database of the monitor and repeats the days for a year; the monitor then watches the site
+from its days. `--minutes` ends it early: the table then has fewer cases, and says how many.
 """
 
 from __future__ import annotations
@@ -42,7 +43,17 @@ from agent.monitor.engines import Sqlite
 from agent.monitor.watch_store import KEPT_DAYS, close_day, source_of
 from agent.site_watch.day_sum import DaySum
 from agent.site_watch.view import watch_site
-from benchmarks.beam_world import BANDS_HZ, FREQUENCY_HZ, Bridge, Damage, World, changed, turned
+from benchmarks.beam_world import (
+    BANDS_HZ,
+    EXCITATIONS,
+    FREQUENCY_HZ,
+    Bridge,
+    Damage,
+    World,
+    changed,
+    otherwise,
+    turned,
+)
 from benchmarks.page import machine, write_part
 from calib.model import Array
 from calib.site_watch.day import Hours, Visits, day_of
@@ -55,6 +66,8 @@ LEARNED_DAYS = 240
 CASES_OF_A_SITE = {8: 8, 30: 20, 200: 40}
 PAIRS_PART = 3 / 8  # cases of two sensors for each case of one: 60 for 160
 DAMAGE_DAYS = 4, 7, 10, 14
+TRAFFIC_DAYS = 4, 7, 14, 30
+TRAFFIC_OF_A_SITE = 8
 TURN_RAD = np.radians(1.0)
 SITE_DAYS = 730
 FIRST_LOOK = 45  # days after the begin of a site
@@ -216,6 +229,42 @@ def sound(seed: int, sensors: int, count: Counter[str]) -> None:
             count[f"false {group}"] += number - last.get((who, group), -99) > 28
             last[who, group] = number
     count["days"] += SITE_DAYS - FIRST_LOOK
+
+
+def traffic(cases: int, end: float) -> str:
+    """What is told of changes of the excitation alone, on any of TRAFFIC_DAYS after them, at 8 sensors."""
+    count: Counter[tuple[str, str]] = Counter()
+    for seed in range(-(-cases // TRAFFIC_OF_A_SITE)):
+        if time.monotonic() > end:
+            break
+        bridge, watch = learned(1000 + seed, 8, World())
+        random = np.random.default_rng(bridge.seed + 3)
+        for k in range(TRAFFIC_OF_A_SITE):
+            kind = EXCITATIONS[(TRAFFIC_OF_A_SITE * seed + k) % len(EXCITATIONS)]
+            other = copy.deepcopy(bridge)
+            other.excitation = otherwise(other, kind, bridge.hour // 24, random)
+            looks = told_after(watch, other.days(max(TRAFFIC_DAYS)), TRAFFIC_DAYS)
+            told = {one.kind for found in looks for one in found.sensors}
+            for what in (kind, "all"):
+                count[what, "cases"] += 1
+                gateways = any(found.gateways for found in looks)
+                count[what, "sensitivity"] += gateways or bool(told & {"sensitivity", "one of two"})
+                count[what, "turn"] += "turn" in told
+                count[what, "bands"] += bool(told & {"sensor or structure", "structure"})
+                count[what, "frequency"] += any(found.frequencies for found in looks)
+                count[what, "excitation"] += "excitation" in told
+        print(f"site {seed + 1}", {name: n for (what, name), n in count.items() if what == "all"}, flush=True)
+    names = "sensitivity", "turn", "bands", "frequency", "excitation"
+    lines = [
+        "| what has changed | told as a sensitivity | as a turn | as bands that change differently | as a frequency "
+        "| as the excitation | cases |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for what in (*EXCITATIONS, "all"):
+        of = count[what, "cases"]
+        cells = [wilson(count[what, name], of) if what == "all" else f"{count[what, name]}" for name in names]
+        lines.append(f"| {what} | {' | '.join(cells)} | {of} |")
+    return "\n".join(lines)
 
 
 def wilson(hits: int, of: int) -> str:
@@ -513,6 +562,7 @@ if __name__ == "__main__":
     parser.add_argument("--cases", type=int, default=160)
     parser.add_argument("--years", type=float, default=0.0)
     parser.add_argument("--minutes", type=float, default=1e6)
+    parser.add_argument("--traffic", action="store_true")
     parser.add_argument("--worlds", action="store_true")
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--kept", action="store_true")
@@ -525,6 +575,10 @@ if __name__ == "__main__":
         name, text = "site-watch kept", f"`python -m benchmarks.site_watch --kept`, {machine()}.\n\n{kept()}"
     elif given.year:
         name, text = "site-watch year", f"`python -m benchmarks.site_watch --year`; {GATEWAYS[8]} gateways.\n\n{year()}"
+    elif given.traffic:
+        text = traffic(given.cases, time.monotonic() + 60.0 * given.minutes)
+        name = "site-watch traffic"
+        text = f"`python -m benchmarks.site_watch --traffic --cases {given.cases}`; {GATEWAYS[8]} gateways.\n\n{text}"
     elif given.worlds:
         text = f"`python -m benchmarks.site_watch --worlds --cases {given.cases}`.\n\n{worlds(given.cases)}"
         name = "site-watch worlds"

@@ -32,9 +32,11 @@ SHAPES = {
     "self_test_supply": "n3",
     "self_test_degc": "n",
     "lag_h": "n",
+    "contrast": "n3",
+    "frequency_contrast": "nb3",
 }
 SELF_TEST = "self_test", "self_test_u", "self_test_supply", "self_test_degc"  # as the fields of SelfTests
-EMPTY = {"frequency", "lag_h", *SELF_TEST}  # arrays that may be left out
+EMPTY = {"frequency", "lag_h", "contrast", "frequency_contrast", *SELF_TEST}  # arrays that may be left out
 
 
 class DaySum(msgspec.Struct, array_like=True, kw_only=True):
@@ -44,7 +46,8 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
     calibration of each sensor in force at the end of the day; `u_main` (n,): its relative standard uncertainty then;
     `main` (n, 3): its main sensitivities, NaN where they are not known. `self_test` and the others: the fields of
     calib.site_watch.day.SelfTests; empty where no sensor has tested itself. `frequency` (n, b, 3): that of Day; empty
-    where no result tells one. `lag_h` (n,): that of Day; empty where no clock is off.
+    where no result tells one. `lag_h` (n,): that of Day; empty where no clock is off. `contrast` (n, 3),
+    `frequency_contrast` (n, b, 3): those of Day; empty in sums of earlier versions, the second also as `frequency`.
     """
 
     number: int
@@ -65,6 +68,8 @@ class DaySum(msgspec.Struct, array_like=True, kw_only=True):
     self_test_degc: bytes = b""
     frequency: bytes = b""
     lag_h: bytes = b""
+    contrast: bytes = b""
+    frequency_contrast: bytes = b""
 
     def array(self, name: str) -> Array:
         """One of the arrays. Raises ValueError where its length is not that of its shape."""
@@ -110,9 +115,10 @@ def summed(
     )
     main = [mains.get((i, made[k]), np.full(3, np.nan)) for i, k in at.items()]
     parts = {"value": day.value, "u": day.u, "level": day.level, "log_noise": day.log_noise, "mean": day.mean_mps2,
-             "u_main": u_main, "main": np.array(main), **_self_tests(sensors, self_tests)}  # fmt: skip
+             "contrast": day.contrast, "u_main": u_main, "main": np.array(main),
+             **_self_tests(sensors, self_tests)}  # fmt: skip
     if np.isfinite(frequency).any():
-        parts["frequency"] = day.frequency
+        parts["frequency"], parts["frequency_contrast"] = day.frequency, day.frequency_contrast
     if day.lag_h is not None:
         parts["lag_h"] = day.lag_h
     return DaySum(number=number, sensors=sensors, bands=bands, temperature_degc=day.temperature_degc, made=made,
@@ -161,6 +167,9 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
         level[to_bands] = one.array("level")[columns]
         frequency = np.full((n, b, 3), np.nan)
         frequency[to[:, None], to_bands] = one.array("frequency")[own[:, None], columns]
+        contrast, by_band = np.full((n, 3), np.nan), np.full((n, b, 3), np.nan)
+        contrast[to] = one.array("contrast")[own]
+        by_band[to[:, None], to_bands] = one.array("frequency_contrast")[own[:, None], columns]
         noise[to], mean[to] = one.array("log_noise")[own], one.array("mean")[own]
         lag_h = np.full(n, np.nan)
         lag_h[to] = one.array("lag_h")[own]
@@ -176,7 +185,7 @@ def days_of(sums: Iterable[DaySum], sensors: Sequence[int], bands: Sequence[int]
         for name, array in zip(SELF_TEST, tests, strict=True):
             array[to] = one.array(name)[own]
         day = Day(one.number, value, u, level, noise, one.temperature_degc, mean, SelfTests(*tests), frequency,
-                  np.nan_to_num(lag_h) if one.lag_h else None)  # fmt: skip
+                  np.nan_to_num(lag_h) if one.lag_h else None, contrast, by_band)  # fmt: skip
         yield SiteDay(day, visits, u_main.copy())
 
 

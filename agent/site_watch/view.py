@@ -43,6 +43,7 @@ DO = {
     "noise": "look at its cable, supply and noise",
     "sensor or structure": "look at the sensor, its mount and the structure there",
     "structure": "look at the structure there",
+    "excitation": "nothing: works, pumps or traffic there have changed",
     "gateway": "visit the gateway: its supply, its clock, its converter; then one of its sensors",
 }
 
@@ -61,9 +62,9 @@ class SiteView:
 
     @property
     def changed(self) -> bool:
-        """Whether anything is told to have changed."""
+        """Whether a sensor, a gateway or the structure is told to have changed."""
         told = [*self.found.sensors, *self.found.gateways.values(), self.found.site]
-        return any(one.kind not in ("none", "learning") for one in told)
+        return any(one.kind not in ("none", "learning", "excitation") for one in told)
 
     def suspected(self, i: int) -> Suspicion | None:
         """What is suspected of the sensitivity or direction of a sensor: by itself, or with its gateway."""

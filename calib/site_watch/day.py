@@ -71,7 +71,9 @@ class Day:
     noise floor. `temperature_degc`: the median of all sensors; NaN where none tells one. `mean_mps2` (n, 3): the median
     of the hours. `self_tests`: None where no sensor has one. `frequency` (n, B, 3): log of the peak frequency over the
     centre of the band, NaN where too few hours tell it. `lag_h` (n,): hours by which the clock of a sensor is late
-    against those of most others; its channels then do not count. None where no clock is off.
+    against those of most others; its channels then do not count. None where no clock is off. `contrast` (n, 3): log
+    amplitude of x, y, z against the level in the quieter half of the hours, less that in the louder half, mean of the
+    bands; None where the hours are not known. `frequency_contrast` (n, B, 3): that of the log of the peak frequency.
     """
 
     number: int
@@ -84,6 +86,8 @@ class Day:
     self_tests: SelfTests | None = None
     frequency: Array | None = None
     lag_h: Array | None = None
+    contrast: Array | None = None
+    frequency_contrast: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +123,8 @@ def day_of(hours: Hours, band_hz: Array) -> Day:
     late = lag_h != 0.0
     amplitude[:, late], counts[:, late], cross[:, late] = np.nan, False, np.nan
     present = np.sum(counts, axis=0)  # (n, B, 3)
-    value, level = _polished(amplitude)
+    value, level, rest = _polished(amplitude)
+    loud = level > _median(level)
     both = np.sum(np.isfinite(cross), axis=0)
     number = np.concatenate([present, both], axis=2)
     told = number >= FEWEST_HOURS
@@ -132,7 +137,7 @@ def day_of(hours: Hours, band_hz: Array) -> Day:
         int(hours.hour[0]) // HOURS,
         np.where(told, values, np.nan),
         np.where(told, u, np.inf),
-        level,
+        _mean(level),
         0.5 * np.log(_positive(_median(hours.noise_psd))),
         float(np.median(temperatures)) if temperatures.size else np.nan,
         None if hours.mean_mps2 is None else _median(hours.mean_mps2),
@@ -140,6 +145,10 @@ def day_of(hours: Hours, band_hz: Array) -> Day:
         if hours.frequency is None
         else np.where(late[:, None, None], np.nan, _frequency(hours.frequency)),
         lag_h=lag_h if late.any() else None,
+        contrast=_mean(np.moveaxis(_contrast(rest, loud), 1, 0)),
+        frequency_contrast=None
+        if hours.frequency is None
+        else np.where(late[:, None, None], np.nan, _contrast(hours.frequency, loud)),
     )
 
 
@@ -170,15 +179,25 @@ def _frequency(hours: Array) -> Array:
     return np.where(enough, _clipped_mean(hours), np.nan)
 
 
-def _polished(amplitude: Array) -> tuple[Array, Array]:
-    """The value of each sensor (n, B, 3) against the level, and the level of the day (B, 3), from (H, n, B, 3)."""
+def _polished(amplitude: Array) -> tuple[Array, Array, Array]:
+    """The value of each sensor (n, B, 3) against the level, the level (H, B, 3), and what is left without it, from
+    (H, n, B, 3)."""
     own = _median(amplitude)
     own = own - _median(own)
     for _ in range(ROUNDS):
         level = _median(np.moveaxis(amplitude - own, 1, 0))  # (H, B, 3)
         rest = amplitude - level[:, None]
         own = _median(rest)
-    return _clipped_mean(rest), _mean(level)
+    return _clipped_mean(rest), level, rest
+
+
+def _contrast(values: Array, loud: NDArray[np.bool_]) -> Array:
+    """Mean of the quiet hours less that of the loud ones (n, B, 3), from `values` (H, n, B, 3) and `loud` (H, B, 3)."""
+    known = np.isfinite(values)
+    quiet, loud = ~loud[:, None] & known, loud[:, None] & known
+    enough = np.minimum(quiet.sum(axis=0), loud.sum(axis=0)) >= FEWEST_HOURS // 2
+    apart = _mean(np.where(quiet, values, np.nan)) - _mean(np.where(loud, values, np.nan))
+    return np.where(enough, apart, np.nan)
 
 
 def _clipped_mean(values: Array) -> Array:

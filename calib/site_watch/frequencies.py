@@ -30,6 +30,7 @@ WALK_PER_ROOT_DAY = 5e-5  # standard uncertainty of its own walk after a day: 0.
 FEWEST_SENSORS = 3  # that must see the mode
 FARTHEST = 0.55  # third octaves from the centre of its window: beyond it a mode stands nearer to that of the next one
 PARTS = 4  # of a window: sensors whose peaks lie in other parts of it see other modes
+PART_CONTRASTED = 0.1  # of a change: by how much quiet and loud hours may differ in it, with their U
 SAME = 1.05  # third octaves from the centre of a window within which a changed frequency moves that of the window
 REACH = 0.06  # relative distance of a changed frequency from the edge of a band that it moves
 
@@ -51,7 +52,8 @@ class FrequencyChange:
 class Joined:
     """For each begin (k), window, axis and part of the window: `size`, `u` (k, B, 3, PARTS) of the step of the sensors
     whose peak lies in it; `statistic`: its size over u with and without the sensor that says most, the smaller one.
-    `information`, `step` (k, n, B, 3) of each sensor; `part` (n, B, 3): in which part its peak lies."""
+    `information`, `step` (k, n, B, 3) of each sensor; `part` (n, B, 3): in which part its peak lies. `contrast`,
+    `u_contrast` (k, n, B, 3): by how much more it stepped in quiet hours than in loud ones; NaN where nothing says."""
 
     size: Array
     u: Array
@@ -59,6 +61,8 @@ class Joined:
     information: Array
     step: Array
     part: NDArray[np.int64]
+    contrast: Array
+    u_contrast: Array
 
 
 def limit_of(bands: int, looks_per_year: float) -> float:
@@ -88,7 +92,16 @@ def joined(watch: SiteWatch, which: list[int], fewest: tuple[int, int], longest_
     exact = np.where(counts, 1.0 / (U_FREQUENCY**2 * np.maximum(variance, 1e-12)), 0.0)
     found = [_group(size, np.where(part == q, information, 0.0), exact, common) for q in range(PARTS)]
     told, u, statistic = (np.stack(each, axis=-1) for each in zip(*found, strict=True))
-    return Joined(told, u, statistic, information, size, part)
+    return Joined(told, u, statistic, information, size, part, *_contrasts(watch, which, fewest))
+
+
+def _contrasts(watch: SiteWatch, which: list[int], fewest: tuple[int, int]) -> tuple[Array, Array]:
+    """Steps (k, n, B, 3) of the contrasts of the frequencies, and their u."""
+    steps, shape = watch.frequency_contrasts, (*watch.shape[:2], 3)
+    size, information, since = (part.reshape(-1, *shape) for part in steps.step(which))
+    counts = (since >= fewest[1]) & (steps.days.reshape(shape) - since >= fewest[0]) & (information > 0.0)
+    u = np.sqrt(pooled(*steps.rest(), shape) * _inverse(information))
+    return np.where(counts, size, np.nan), np.where(counts, u, np.nan)
 
 
 def _group(size: Array, information: Array, exact: Array, common: Array) -> tuple[Array, Array, Array]:
@@ -132,11 +145,23 @@ def changed(watch: SiteWatch, found: Joined, limit: float) -> list[FrequencyChan
         weight = np.where(found.part[:, w, axis] == q, found.information[k, :, w, axis], 0.0)
         size = float(found.size[k, w, axis, q])
         hz = float(watch.band_hz[w] * np.exp(np.sum(weight * mean[:, w, axis]) / weight.sum()))
+        if _by_excitation(size, weight, found.contrast[k, :, w, axis], found.u_contrast[k, :, w, axis]):
+            continue
         see = int(np.sum((weight > 0.0) & (found.step[k, :, w, axis] / size > 0.5)))
         if all(abs(np.log(watch.band_hz[w] / other.hz)) > SAME * THIRD_OCTAVE for other in told):
             u, sensors = float(found.u[k, w, axis, q]), (see, int(np.sum(weight > 0.0)))
             told.append(FrequencyChange(hz, size, u, z[:, w, axis, q] ** 2, sensors, float(best[w, axis, q])))
     return told
+
+
+def _by_excitation(size: float, weight: Array, contrast: Array, u: Array) -> bool:
+    """Whether quiet and loud hours of the sensors (n,) may have moved otherwise: a mode moves in all of them by one
+    `size`; where modes share a window, their mixture follows what excites them."""
+    known = np.isfinite(contrast) & (weight > 0.0)
+    if not known.any():
+        return False
+    share = weight[known] / weight[known].sum()
+    return abs(float(share @ contrast[known])) + 2.0 * float(share @ u[known]) > PART_CONTRASTED * abs(size)
 
 
 def moved_bands(band_hz: Array, changes: list[FrequencyChange]) -> NDArray[np.bool_]:

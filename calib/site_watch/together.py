@@ -35,6 +35,11 @@ MEDIAN_SQUARE = 0.4549  # the median m of the square of a standard normal deviat
 # relative variance 5.44 / N, which is 1 / (N (2 m f)²) with their density f = 0.471 at m. So this prior is the best
 # one where the variances at begins differ from what is expected by 30 % (5.44 / 0.3² = 60). The 30 % are assumed.
 PRIOR_TESTS = 60.0
+# Bands that are worth what is stated of the scatter of a sensor's bands at a begin. The mean of N squares has the
+# relative variance 2 / N, so this prior is the best one where the variances of sensors differ from what is stated by
+# the same 30 % (2 / 0.3² = 22).
+PRIOR_BANDS = 22.0
+ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 REJECT = 6.0  # standard uncertainties from which a sensor or channel does not say what is common (Tukey's biweight)
 ROUNDS = 4
 FEWEST_TO_NAME = 3  # sensors with a band, for it to say which one has changed
@@ -101,20 +106,22 @@ def _rotation(turn: Array) -> Array:
 @dataclass(frozen=True, slots=True, eq=False)
 class JointChange:
     """For each begin (k): `size`, `u` (k, n, 7): the change in each of DIRECTIONS by itself. `rest` (k, n, B, 6):
-    steps without what is common; `information` (k, n, B, 6): of these, over the variance; `G` (k, n, B, 6, 6): what a
-    change of one unit makes of them. `statistic` (k, n, 7): the change over its u; of a turn the smaller one of this
-    and the same without the band that says most, since the weak axis of one band says much of a turn, and moves by
-    itself when the loads of two modes change. `scatter` (k, 1, 7): factor of u by what all sensors of the site differ
-    by. `pair` (k,): no more than two sensors can be compared, so that both show a change of either."""
+    steps without what is common; `information` (k, n, B, 6): of these, over the variance. `statistic` (k, n, 7): the
+    change over its u; of a turn the smaller one of this and the same without the band that says most, since the weak
+    axis of one band says much of a turn, and moves by itself when the loads of two modes change. `scatter` (k, 1, 7):
+    factor of u by what all sensors of the site differ by. `pair` (k,): no more than two sensors can be compared, so
+    that both show a change of either. `squares`, `freedom` (k, n): what no change of sensitivities and no turn explains
+    of the bands of a sensor, as in `misfit`."""
 
     size: Array
     u: Array
     rest: Array
     information: Array
-    G: Array
     statistic: Array
     scatter: Array
     pair: NDArray[np.bool_]
+    squares: Array
+    freedom: NDArray[np.int_]
 
     @property
     def evidence(self) -> Array:
@@ -142,6 +149,8 @@ def jointly(step: Array, information: Array, value: Array, level: Array, inflati
     far = (np.abs(size[..., TURNS]) > FAR * u[..., TURNS]).any(axis=-1)
     far &= np.sum(alone > 0.0, axis=(-2, -1)) > G.shape[-1]  # more channels than unknowns
     rest[far], G[far] = _about_turns(rest[far], alone[far], value[far], level[far])
+    squares, freedom = misfit(rest, alone, G)
+    inflation = _spread(rest, alone, squares, freedom, inflation)
     size, u = _sized(*scores(rest, alone, G), inflation, walk)
     # Of two the level is the mean, so each shows half of what they differ by, and half of its scatter.
     u[pair, :, SENSITIVITIES] *= np.sqrt(2.0)
@@ -154,7 +163,7 @@ def jointly(step: Array, information: Array, value: Array, level: Array, inflati
         np.abs(statistic[..., TURNS]), np.sign(size[..., TURNS]) * size_apart / u_apart / scatter[..., TURNS]
     )
     statistic[..., TURNS] = np.sign(size[..., TURNS]) * np.maximum(least, 0.0)
-    return JointChange(size, u, rest, alone, G, statistic, scatter, pair)
+    return JointChange(size, u, rest, alone, statistic, scatter, pair, squares, freedom)
 
 
 def _about_turns(step: Array, information: Array, value: Array, level: Array) -> tuple[Array, Array]:
@@ -196,6 +205,34 @@ def _sized(score: Array, squares: Array, inflation: Array, walk: Array) -> tuple
     squares = np.where(known, squares, 1.0)
     variance = np.where(known, inflation / squares, np.inf)
     return np.where(known, score / squares, 0.0), np.sqrt(variance + walk[:, None, None] ** 2)
+
+
+def misfit(rest: Array, information: Array, G: Array) -> tuple[Array, NDArray[np.int_]]:
+    """The squares (k, n) that the best sensitivities and turns of a sensor leave of its steps, and their degrees of
+    freedom. Bands of a change may differ by ALIKE of it."""
+    theta = fitted(rest, information, G)
+    explained = (G @ theta[:, :, None, :, None])[..., 0]
+    own = information / (1.0 + information * np.square(ALIKE * explained))
+    squares = np.sum(own * np.square(rest - explained), axis=(-2, -1))
+    return squares, np.sum(information > 0.0, axis=(-2, -1)) - theta.shape[-1]
+
+
+def _spread(rest: Array, information: Array, squares: Array, freedom: NDArray[np.int_], inflation: Array) -> Array:
+    """Variance (k, n, 7) of each direction over what independent channels have: `inflation`, or what the bands of a
+    sensor say of it by how far they differ, whichever is larger (Birge's ratio). Of a sensitivity the bands of its axes
+    count, of a turn what `misfit` leaves.
+
+    A sensitivity moves all bands alike. Where the structure is excited otherwise each band moves by itself, so the
+    mean of few bands says little.
+    """
+    r, info = rest[..., :3], information[..., :3]
+    parts = (info > 0.0).sum(axis=2), info.sum(axis=2), (info * r).sum(axis=2), (info * r * r).sum(axis=2)  # (k, n, 3)
+    number, total, push, own = (np.concatenate([p, p.sum(axis=-1, keepdims=True)], axis=-1) for p in parts)
+    own = own - push**2 / np.where(total > 0.0, total, 1.0)
+    turn = [np.repeat(each[..., None], 3, axis=-1) for each in (squares, freedom)]
+    left = np.concatenate([own, turn[0]], axis=-1)
+    f = np.maximum(np.concatenate([number - 1, turn[1]], axis=-1), 0)
+    return np.asarray(np.maximum((PRIOR_BANDS * inflation + left) / (PRIOR_BANDS + f), inflation))
 
 
 def _scatter_of_all(statistic: Array) -> Array:

@@ -18,7 +18,7 @@ from calib.site_watch import frequencies
 from calib.site_watch.frequencies import FrequencyChange
 from calib.site_watch.scatter import Blocks
 from calib.site_watch.steps import PRIOR_DEGREES, TERMS, Steps
-from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, fitted, jointly, median
+from calib.site_watch.together import ALL, DIRECTIONS, SENSITIVITIES, JointChange, jointly, median
 from calib.site_watch.watch import VISIT, SiteWatch, pooled
 from calib.site_watch.witnesses import Witness, gravity, noise, self_test
 
@@ -33,7 +33,6 @@ APART_MISFIT = 1.1  # factor of the squares by which bands differ, for what the 
 # structure. Assumed; the simulated bridge has up to 0.15, the more the nearer they stand (docs/site-watch.md).
 PART_SHARED = 0.25
 LEAST_NOISE = 0.03  # of the amplitude of the noise, for its change to be told: a sensitivity changes the noise alike
-ALIKE = 0.1  # of a change: how far its bands may differ by themselves
 # Of an angle, relative: days tell means of cross powers and of log amplitudes, and a turn acts in each hour by itself.
 U_TURN = 0.1
 FEWEST_BANDS = 3  # for bands to be called alike
@@ -45,6 +44,9 @@ LONGEST_DAYS = 365  # of the norm, over which the walk counts
 LEAST_VARIANCE = 0.2  # of a channel's variance, that a step leaves
 SUSPECTED = "sensitivity", "one of two", "turn"  # verdicts of a sensor by itself that witnesses are asked of
 FOLLOW = *SUSPECTED, "sensor or structure", "gateway"  # what may follow from a change of a frequency
+# Of the change of a sensor: by how much quiet and loud hours must differ in it to be told as the excitation. Damage
+# that was simulated had up to 0.75 in an axis that hardly moves, at 3.1 u or less; sources had 0.5 to 2.
+PART_CONTRASTED = 0.25
 EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told apart (2 standard deviations)
 
 
@@ -52,7 +54,8 @@ EVIDENCE_DROP = 4.0  # of the squared statistic: begins within it are not told a
 class SensorVerdict:
     """A verdict of a sensor or gateway.
 
-    `kind`: none, learning, sensitivity, one of two, turn, noise, structure, sensor or structure, gateway, clock.
+    `kind`: none, learning, sensitivity, one of two, turn, noise, structure, sensor or structure, gateway, excitation,
+    clock.
     `what`: in words. `size`, `U`: change of the log of the sensitivity (relative change of the amplitude of the noise),
     or angle in rad; expanded by COVERAGE. `since`, `earliest`, `latest`: days since 1970; -1 where none is told.
     `statistic`: size over its standard uncertainty, or a normal equivalent. `direction`: index in
@@ -150,6 +153,7 @@ def result(watch: SiteWatch, known_u: Array | None = None) -> SiteVerdicts:
         for i in range(n):
             if sensors[i].kind == "none" and not anchored[i]:
                 sensors[i] = _sensor(tests, i, limit, floors[i])
+        sensors = [_excited(watch, tests, i, told, limit) for i, told in enumerate(sensors)]
         _of_two(tests, sensors)
         gateways = _gateways(watch, tests, sensors, limit)
         _follow_frequencies([told for _, told in changed], sensors, gateways)
@@ -262,11 +266,7 @@ def _apart(joint: JointChange) -> Array:
 
     What most sensors show, such as days that the norm does not fit, is taken as scatter.
     """
-    info, theta = joint.information, fitted(joint.rest, joint.information, joint.G)
-    explained = (joint.G @ theta[:, :, None, :, None])[..., 0]
-    own = info / (1.0 + info * np.square(ALIKE * explained))
-    squares = np.sum(own * np.square(joint.rest - explained), axis=(-2, -1))
-    freedom = np.sum(info > 0.0, axis=(-2, -1)) - theta.shape[-1]
+    squares, freedom = joint.squares, joint.freedom
     f = np.maximum(freedom, 1).astype(float)
     site = np.where(joint.pair, 1.0, median(np.where(freedom > 0, squares / f, np.nan), axis=1))
     ratio = squares / f / (APART_MISFIT * np.maximum(site, 1.0))[:, None]
@@ -303,6 +303,25 @@ def _clocks(watch: SiteWatch, sensors: list[SensorVerdict]) -> None:
         if sensors[i].kind in ("none", "learning"):
             hours, late = abs(int(watch.lag_h[i])), "late" if watch.lag_h[i] > 0.0 else "early"
             sensors[i] = SensorVerdict("clock", f"its hours come {hours} h {late} against those of the other sensors")
+
+
+def _excited(watch: SiteWatch, tests: Tests, i: int, told: SensorVerdict, limit: float) -> SensorVerdict:
+    """What sensor `i` is told of; or that it is excited otherwise, where quiet and loud hours differ by another amount
+    since then, on any axis. A sensitivity changes all hours alike, and damage nearly so."""
+    if told.kind not in ("sensitivity", "one of two", "sensor or structure"):
+        return told
+    begins = watch.contrasts.begins
+    which = [k for k in _begins(watch) if begins[k] >= told.earliest - FEWEST_SINCE]
+    step, u = (part[:, i] for part in _followed(watch, watch.contrasts, watch.contrast_scatter, which))
+    at = tests.begins.index(told.since)
+    rest, info = tests.joint.rest[at, i, :, :3], tests.joint.information[at, i, :, :3]
+    size = np.sqrt(np.sum(info * np.square(rest), axis=0) / np.maximum(info.sum(axis=0), 1e-300))
+    z = np.where(np.abs(step) > PART_CONTRASTED * size, np.abs(step) / u, 0.0).max(axis=1)
+    if z.max() <= limit:
+        return told
+    best, dates = dated([begins[k] for k in which], np.square(z))
+    what = "its quiet and loud hours differ otherwise: what moves the structure there has changed"
+    return SensorVerdict("excitation", what, 0.0, np.inf, *dates, float(z[best]))
 
 
 def _of_two(tests: Tests, sensors: list[SensorVerdict]) -> None:
@@ -364,7 +383,7 @@ def _gateways(watch: SiteWatch, tests: Tests, sensors: list[SensorVerdict], limi
     told: dict[int, SensorVerdict] = {}
     if len(numbers) < 2:
         return told
-    alike = np.array([told.kind != "sensor or structure" for told in sensors])
+    alike = np.array([told.kind not in ("sensor or structure", "excitation") for told in sensors])
     mean, u, fits = _means(tests.joint, index, alike)
     pair = len(numbers) == 2
     what = "the two gateways differ; which of them changed is not seen" if pair else "all its sensors alike"

@@ -51,13 +51,16 @@ class SiteWatch:
         self.noise = Steps(self.shape[0] * 3)
         self.means = Steps(self.shape[0] * 3, MEAN_PRIOR_SCALE)
         self.self_tests = Steps(self.shape[0] * 3)
+        self.contrasts = Steps(self.shape[0] * 3)
         self.frequencies = Steps(self.shape[0] * self.shape[1] * 3)
+        self.frequency_contrasts = Steps(self.shape[0] * self.shape[1] * 3)
         self.u_supply = np.full((self.shape[0], 3), np.nan)  # of the newest self-test
         self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)), LAGS_DAYS, MEMORY_DAYS, PRIOR_BLOCKS)
         self.band_scatter = Blocks(self.shape, lags=(1, 7))
         self.noise_scatter = Blocks((self.shape[0], 3))
         self.mean_scatter = Blocks((self.shape[0], 3))
         self.self_test_scatter = Blocks((self.shape[0], 3))
+        self.contrast_scatter = Blocks((self.shape[0], 3))
         self.frequency_scatter = Blocks((self.shape[1] * 3, 1))  # of all sensors together
         self.visits = np.zeros((0, len(VISIT)))  # of each visit that taught something
         self.origin = np.full((self.shape[1], 3), np.nan)  # levels of the first day
@@ -104,6 +107,9 @@ class SiteWatch:
         mean = np.where(untold, np.nan, 0.0 if day.mean_mps2 is None else day.mean_mps2)
         u_mean = np.full((self.shape[0], 3), U_MEAN_MPS2)
         self._follow(self.means, self.mean_scatter, np.broadcast_to(mean, u_mean.shape), u_mean, degc)
+        contrast = np.full(u_mean.shape, np.nan) if day.contrast is None else day.contrast
+        contrast = np.where(visited[:, None], np.nan, contrast)
+        self._follow(self.contrasts, self.contrast_scatter, contrast, np.full(u_mean.shape, U_BAND), degc, squared=True)
         self._take_self_tests(day, visited)
         self._take_frequencies(day, x)
         self._seen(there.sum(axis=(1, 2)) > 0)
@@ -155,6 +161,7 @@ class SiteWatch:
         self.steps.restart(channels)
         self.means.restart(np.repeat(visited, 3))
         self.self_tests.restart(np.repeat(visited, 3))
+        self.contrasts.restart(np.repeat(visited, 3))
         self.seen_degc[visited] = np.inf, -np.inf
 
     def _regressors(self, day: Day) -> Array:
@@ -217,27 +224,32 @@ class SiteWatch:
         weight = there / U_FREQUENCY**2 * np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9))
         steps.update(self.day, x, np.nan_to_num(told).ravel(), weight.ravel())
         self.frequency_scatter.remember(steps.begins)
+        none = np.full(shape, np.nan)
+        contrast = none if day.frequency_contrast is None else day.frequency_contrast
+        degc = np.full(self.shape[0], day.temperature_degc)
+        self._follow(self.frequency_contrasts, None, contrast, np.full(shape, U_FREQUENCY), degc, squared=True)
 
     def _follow(
-        self, steps: Steps, scatter: Blocks, told: Array, u: Array, degc: Array, *, squared: bool = False
+        self, steps: Steps, scatter: Blocks | None, told: Array, u: Array, degc: Array, *, squared: bool = False
     ) -> None:
-        """Noise floors, means and responses (n, 3) are followed as the channels are, without a level; `u` (n, 3): of
-        one of them; `degc` (n,). `squared`: the norm has the square of the temperature too."""
+        """Noise floors, means, responses and contrasts `told` (n, ...) are followed as the channels are, without a
+        level; `u` (n, ...): of one of them; `degc` (n,). `squared`: the norm has the square of the temperature too."""
         value = told.ravel()
         there = np.isfinite(value)
         x = np.zeros((TERMS, len(value)))
         x[0] = 1.0
-        x[1] = np.repeat(np.nan_to_num((degc - ORIGIN_DEGC) / SCALE_K), 3)
+        x[1] = np.repeat(np.nan_to_num((degc - ORIGIN_DEGC) / SCALE_K), len(value) // len(degc))
         x[2] = x[1] ** 2 if squared else 0.0
         u2_told = np.where(there, np.square(u.ravel()), 1.0)
         expected, u2 = steps.expected(x)
-        s2 = pooled(*steps.rest(), (self.shape[0], 3)).ravel()
+        s2 = pooled(*steps.rest(), told.shape).ravel()
         z = (np.nan_to_num(value) - expected) / np.sqrt(np.maximum(s2, 1e-12) * (u2_told + u2))
         known = there & (steps.days - TERMS >= FEWEST_LEFT)
-        scatter.update(z.reshape(-1, 3), known.reshape(-1, 3))
         weight = there / u2_told * np.where(known, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)), 1.0)
         steps.update(self.day, x, np.nan_to_num(value), weight)
-        scatter.remember(steps.begins)
+        if scatter is not None:
+            scatter.update(z.reshape(told.shape), known.reshape(told.shape))
+            scatter.remember(steps.begins)
 
     def _seen(self, told: NDArray[np.bool_]) -> None:
         if np.isfinite(self.degc):
@@ -247,8 +259,9 @@ class SiteWatch:
 
 _OWN = ("origin", "seen_degc", "degc", "visits", "u_supply", "lag_h")
 _PARTS = (
-    *("steps", "noise", "means", "self_tests", "frequencies"),
-    *("days_scatter", "band_scatter", "noise_scatter", "mean_scatter", "self_test_scatter", "frequency_scatter"),
+    *("steps", "noise", "means", "self_tests", "contrasts", "frequencies", "frequency_contrasts"),
+    *("days_scatter", "band_scatter", "noise_scatter", "mean_scatter", "self_test_scatter", "contrast_scatter"),
+    "frequency_scatter",
 )
 
 

@@ -37,7 +37,7 @@ ELSEWHERE = {
     "site-runs": "benchmarks.site", "site-large": "benchmarks.site",
     **dict.fromkeys(("table", "known", "skirts", "inside"), "benchmarks.response"), "walks": "benchmarks.walks",
     **{f"site-watch {name}": "benchmarks.site_watch"
-       for name in ("8", "8 sound", "30", "30 sound", "200", "worlds", "cost", "kept", "year")},
+       for name in ("8", "8 sound", "30", "30 sound", "200", "traffic", "worlds", "cost", "kept", "year")},
     "faults": "tests.faults.outcome", "soak-day": "benchmarks.soak", "soak-hour": "benchmarks.soak",
     **{name: f"benchmarks.online.{name}" for name in
        ("agreement", "bench", "bridge", "chip", "cost", "coverage", "day", "filters", "harm", "lorries",

@@ -107,6 +107,9 @@ def test_the_frequency_of_a_day_is_in_its_sum_and_earlier_sums_have_none(rows: l
     assert days[1].frequency is not None
     assert np.isnan(days[1].frequency).all()
     assert len(sums[1].frequency) == 0
+    assert days[0].contrast is not None
+    assert len(sums[0].contrast) == 4 * 3
+    assert len(sums[1].frequency_contrast) == 0
 
 
 @pytest.mark.thorough

@@ -92,6 +92,25 @@ def test_a_frequency_that_falls_at_all_sensors_is_the_structure(band: int) -> No
     assert not found.gateways
 
 
+@pytest.mark.parametrize(("by_night", "by_day", "told"), [(0.02, 0.02, 1), (0.01, 0.03, 0), (0.04, 0.0, 0)])
+def test_what_moves_in_loud_hours_otherwise_than_in_quiet_ones_is_no_mode(
+    by_night: float, by_day: float, told: int
+) -> None:
+    """Where two modes share a window, their mixture follows what excites them, so a lane that is closed moves it."""
+    night = (np.arange(24) < 12)[:, None, None, None]
+    site, watch = Frequencies(3), SiteWatch(GATEWAY, BANDS_HZ)
+    for k in range(60):
+        hours, _ = site.day()
+        level = np.where(night, 0.5, 1.0)
+        fallen = np.where(night, by_night, by_day) * (np.arange(len(BANDS_HZ)) == 2)[:, None] * (k >= 50)
+        assert hours.frequency is not None
+        moved = hours.frequency - fallen
+        watch.update(
+            day_of(replace(hours, power=level * hours.power, cross=level * hours.cross, frequency=moved), BANDS_HZ)
+        )
+    assert len(result(watch).frequencies) == told
+
+
 @pytest.mark.thorough
 def test_sound_frequencies_follow_the_temperature_and_are_not_told() -> None:
     assert [len(after(40, seed=seed).frequencies) for seed in range(2)] == [0, 0]
@@ -212,7 +231,8 @@ def test_sensors_whose_bands_differ_say_nothing_of_their_gateway() -> None:
     size[:, 2] = 0.02
     none = np.zeros((1, N, 1, 6))
     factor, pair = np.ones((1, 1, len(DIRECTIONS))), np.zeros(1, dtype=bool)
-    joint = JointChange(size, np.full_like(size, 0.002), none, none, none[..., None], size / 0.002, factor, pair)
+    left, freedom = np.zeros((1, N)), np.zeros((1, N), dtype=int)
+    joint = JointChange(size, np.full_like(size, 0.002), none, none, size / 0.002, factor, pair, left, freedom)
     assert _means(joint, GATEWAY, there)[0][0] == pytest.approx([0.0, 0.01, 0.0])
     there[2] = False
     mean, u, fits = _means(joint, GATEWAY, there)

@@ -279,12 +279,12 @@ def test_the_false_alarms_of_two_sensors_are_those_of_one_comparison() -> None:
 def test_a_band_of_two_sensors_names_none_where_three_are_compared_in_others() -> None:
     one, none = np.ones((1, 9, 7)), np.zeros(1)
     step, information, value, level = steps_of(np.zeros((9, 6, 3)))
-    information[0, :7, 0, 0] = 0.0
-    step[0, 7, 0, 0] = 0.5
+    information[0, :7, :, 0] = 0.0
+    step[0, 7, :, 0] = 0.5
     told = jointly(step, information, value, level, one, none)
     assert not told.pair.any()
     assert np.abs(told.statistic).max() < 1e-6
-    information[0, 6, 0, 0] = 1e4
+    information[0, 6, :, 0] = 1e4
     assert jointly(step, information, value, level, one, none).statistic[0, 7, 0] > 5.0
 
 
@@ -467,12 +467,24 @@ def test_what_all_sensors_differ_by_at_a_begin_is_scatter_and_one_that_changes_i
     sound = jointly(*steps_of(z), one, none)
     assert sound.scatter.max() < 1.2
     frost = jointly(*steps_of(3.0 * z), one, none)
-    assert 2.2 < frost.scatter[0, 0, 0] < 3.0
+    assert 2.2 < np.median(frost.u[..., :3] / sound.u[..., :3]) < 3.0, "by the bands of each, and by all sensors"
     assert frost.evidence[..., :4] == pytest.approx((frost.size / frost.u * frost.scatter)[..., :4]), "dates"
     z[4] += 20.0
     changed = jointly(*steps_of(z), one, none)
     assert changed.scatter.max() < 1.2
     assert changed.statistic[0, 4, ALL] > 30.0
+
+
+def test_a_sensitivity_is_as_uncertain_as_its_bands_differ() -> None:
+    """One of six bands moves by 30 standard deviations, which is 11.5 of their mean against the other eight sensors.
+    The squares are then 30² 8/9 5/6 = 667, and with a prior of 22 bands u² grows by (22 + 667) / (22 + 5) = 25.5. What
+    all bands share keeps its u."""
+    z, one, none = np.zeros((9, 6, 3)), np.ones((1, 9, 7)), np.zeros(1)
+    mean = np.sqrt(6.0 * 8.0 / 9.0)
+    z[7, 2, 2] = 30.0
+    assert jointly(*steps_of(z), one, none).statistic[0, 7, 2] == pytest.approx(5.0 * mean / np.sqrt(25.5), rel=0.01)
+    z[7, :, 2] = 5.0
+    assert jointly(*steps_of(z), one, none).statistic[0, 7, 2] == pytest.approx(5.0 * mean, rel=0.01)
 
 
 def test_a_turn_stands_without_the_band_that_says_most() -> None:
@@ -537,6 +549,60 @@ def test_a_clock_that_is_hours_off_is_told_and_its_hours_do_not_count() -> None:
         assert (day.lag_h is None) == (not late)
         assert np.array_equal(np.zeros(9) if day.lag_h is None else day.lag_h, expected)
         assert np.isnan(day.value).all(axis=(1, 2)).tolist() == [i in late for i in range(9)]
+
+
+NIGHT = np.arange(24) < 8
+
+
+def otherwise(hours: Hours, sensor: int, by_night: float, by_day: float) -> Hours:
+    """The same hours, in which the amplitudes of a sensor are larger by these parts in all bands."""
+    power, cross = hours.power.copy(), hours.cross.copy()
+    grown = (1.0 + np.where(NIGHT, by_night, by_day)[:, None, None]) ** 2
+    power[:, sensor] *= grown
+    cross[:, sensor] *= grown
+    return replace(hours, power=power, cross=cross)
+
+
+@pytest.fixture(scope="module")
+def lived() -> tuple[SiteWatch, Array]:
+    """A site of nine sensors for 50 days, with quiet nights, and the levels of its hours."""
+    level = np.random.default_rng(12).normal(0, 0.1, (24 * 70, 1, 1)) - 0.8 * np.tile(NIGHT, 70)[:, None, None]
+    hourly, watch = np.repeat(np.repeat(level, 6, axis=1), 3, axis=2), SiteWatch(GATEWAY, BANDS_HZ)
+    for k in range(50):
+        watch.update(day_of(hours_of(20_000 + k, {}, hourly[24 * k : 24 * k + 72]), BANDS_HZ))
+    return watch, hourly
+
+
+@pytest.mark.parametrize(
+    ("by_night", "by_day", "told"),
+    [(0.03, 0.0, "excitation"), (0.0, 0.015, "excitation"), (0.01, 0.01, "sensitivity"), (0.0, 0.0, "none")],
+)
+def test_what_quiet_hours_show_and_loud_ones_do_not_is_the_excitation(
+    lived: tuple[SiteWatch, Array], by_night: float, by_day: float, told: str
+) -> None:
+    """A factory that runs at night beside sensor 4 adds as much to its motion as another sensitivity by 1 % would, in
+    the mean of a day and in all bands. Works by day do so as well."""
+    watch, hourly = SiteWatch.loaded(lived[0].snapshot()), lived[1]
+    for k in range(50, 60):
+        hours = otherwise(hours_of(20_000 + k, {}, hourly[24 * k : 24 * k + 72]), 4, by_night, by_day)
+        watch.update(day_of(hours, BANDS_HZ))
+    found = result(watch)
+    assert kinds(found) == ({4: told} if told != "none" else {})
+    assert not found.gateways
+    assert found.site.kind == "none"
+    if told == "excitation":
+        assert found.sensors[4].earliest <= 20_050 <= found.sensors[4].latest
+        assert np.isinf(found.sensors[4].U)
+
+
+def test_the_contrast_of_a_day_is_that_of_its_quiet_hours(lived: tuple[SiteWatch, Array]) -> None:
+    """12 of 24 hours are quiet, and all 8 of the night are among them."""
+    hours = hours_of(20_000, {}, lived[1][:72])
+    sound, day = (day_of(one, BANDS_HZ).contrast for one in (hours, otherwise(hours, 4, 0.03, 0.0)))
+    assert sound is not None
+    assert day is not None
+    assert day[4] - sound[4] == pytest.approx(np.full(3, np.log(1.03) * 8 / 12), abs=3e-3)
+    assert np.abs(np.delete(day - sound, 4, axis=0)).max() < 3e-3, "the level of each hour is a median"
 
 
 @pytest.mark.thorough
