@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from agent.calibrate.origin import SourceFile
 from agent.config.earlier import LARGEST_VALUE
 from agent.core.events import CalibrationUpdate
 from calib.estimate.axes import axis_warnings
+from calib.excitation.windows import CALM
 from calib.model import PARAMETERS, Array
 from calib.output_unit import shown_in
 
@@ -40,7 +41,10 @@ class ResultError(ValueError):
 
 
 class WindowVerdict(msgspec.Struct, frozen=True):
-    """One window: its times in seconds since the first sample, and whether it was used or why not."""
+    """One window: its times in seconds since the first sample, and whether it was used or why not.
+
+    `held`: it was not used, and further windows might have confirmed it; files have no such windows.
+    """
 
     start_s: float
     stop_s: float
@@ -50,6 +54,14 @@ class WindowVerdict(msgspec.Struct, frozen=True):
     left_out: int = 0
     position: str = ""
     kind: str = ""
+    held: bool = False
+
+    @property
+    def verdict(self) -> Literal["used", "held", "calm", "refused"]:
+        """What became of it."""
+        if self.used or self.held:
+            return "used" if self.used else "held"
+        return "calm" if self.kind == "quiet" or self.reason == CALM else "refused"
 
 
 class ThirdOctave(msgspec.Struct, frozen=True):

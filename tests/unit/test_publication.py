@@ -221,7 +221,7 @@ def test_a_result_that_the_store_refuses_still_leaves(site: Site, store: Store, 
         samples = samples_up_to(subscriber, 2)
         assert [sequence_of(s) for s in samples] == [1, 2]
         assert numbers_before(samples) == ["0", "0"], "a consumer must ask the store what came before 2"
-        assert store.published() == 1
+        wait_for(lambda: store.published() == 1)
         store._connection.execute("PRAGMA max_page_count = 100000")
         send(publisher, store, 3)
         assert received(subscriber, 3) == [2, 3], "what is kept late goes out again, in order"
