@@ -286,7 +286,7 @@ def test_a_name_that_cannot_be_in_a_key_is_refused(store: Store, name: str) -> N
 
 
 def test_an_endpoint_that_is_none_is_refused(store: Store) -> None:
-    with pytest.raises(EndpointError, match=r"not an endpoint such as .*: router7447$"):
+    with pytest.raises(EndpointError, match=r"^not an endpoint: router7447: .* as in tcp/192.0.2.1:7447$"):
         Publisher("site", "gw", ["router7447"], store)
 
 
