@@ -175,6 +175,19 @@ sensitivity = 1670.7
 """
 
 
+@pytest.mark.parametrize("name", ["notes.txt", "notes.txt/data"])
+def test_a_data_directory_that_is_a_file_is_named_with_the_remedy(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "f.toml").write_text(GOOD, "utf-8")
+    (tmp_path / "notes.txt").write_text("mine", "utf-8")
+    arguments = ["run", str(tmp_path / "f.toml"), "--data-dir", str(tmp_path / name), "--duration", "0.1"]
+    assert run_cli([*arguments, "--log", "plain"]) == 2
+    told = f"fieldcal run: {tmp_path / name}: is no directory; name another one with --data-dir\n"
+    assert told in capsys.readouterr().err
+    assert (tmp_path / "notes.txt").read_text("utf-8") == "mine"
+
+
 @pytest.mark.parametrize("bus", [250, 251])
 def test_a_part_that_answers_for_others_and_is_not_alone(
     bus: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
