@@ -15,7 +15,8 @@ OPENED = DeviceChange(device="laser", state="open", t_monotonic_ns=0, t_utc_ns=0
 
 def blocks(rate_hz: float, seconds: float, *, begin_s: float = 0.0, waiting: int = 0) -> list[Event]:
     """Blocks each half second; with the first come `waiting` samples that a buffer held."""
-    size, made, index = round(rate_hz / 2), [], 0
+    size, index = round(rate_hz / 2), 0
+    made: list[Event] = []
     for k in range(round(2 * seconds)):
         n = size + (waiting if k == 0 else 0)
         at = np.array([(begin_s + 0.5 * k) * 1e9], dtype=np.int64)
