@@ -138,6 +138,8 @@ FAULTS: list[tuple[Callable[[], Outcome], tuple[str, int | None, str], str]] = [
     (lambda: calibrate(SENSOR | {"vz": ["x"] * 11982}), ("sensor", 0, "vz"), "'x'.* is no number"),
     (lambda: calibrate(SENSOR | {"vz": 1j * SENSOR["vz"]}), ("sensor", 0, "vz"), "is no number"),
     (lambda: calibrate(np.ones((5, 3))), ("sensor", None, ""), "there are 3 columns; give 4: time_s, vx, vy, vz"),
+    (lambda: calibrate({"secs": [1, 1], "nsecs": [0, 5]} | {k: [0.0, 1.0] for k in "xyz"}), ("sensor", None, ""),
+     "'secs' has whole seconds, and 'nsecs' their parts.*write the sum of both in one column"),
     (lambda: calibrate("sensor.csv"), ("sensor", None, ""), "str is no table; give a DataFrame"),
     (lambda: calibrate(SENSOR, REFERENCE | {"v": REFERENCE["a"]}, POSES), ("reference", None, ""), "give one of"),
     (lambda: calibrate(SENSOR, REFERENCE, posed(2, stop_s=1.0)), ("poses", 2, "stop_s"), "1 is not after start_s 20"),
