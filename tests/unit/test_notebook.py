@@ -15,6 +15,7 @@ import pytest
 
 from agent.cli.main import run_cli
 from calib import Calibration, InputError, calibrate
+from calib.distributions import coverage_factor
 from calib.recorded.errors import OptionError
 from calib.recorded.options import DEFAULTS, Options
 from calib.recorded.outcome import Outcome
@@ -172,6 +173,12 @@ def test_a_value_that_is_missing_is_a_gap(result: Outcome) -> None:
     with_gaps = calibrate(SENSOR | {"vx": masked}, REFERENCE, POSES, **OPTIONS)
     assert with_gaps.to_json() == calibrate(as_nan, REFERENCE, POSES, **OPTIONS).to_json() != result.to_json()
     assert with_gaps.status == "valid"
+
+
+def test_the_coverage_factor_rests_on_the_fewest_effective_degrees_of_freedom(result: Outcome) -> None:
+    told = json.loads(result.to_json())["effective_degrees_of_freedom"]
+    freedom = np.append(np.array(told["sensitivity"], dtype=float), np.array(told["offset"], dtype=float))
+    assert result.coverage_factor == pytest.approx(coverage_factor(freedom[result.determined].min()), rel=1e-12)
 
 
 def test_dates_are_times(result: Outcome) -> None:

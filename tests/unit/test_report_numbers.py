@@ -94,6 +94,16 @@ def test_a_held_window_is_neither_used_nor_refused() -> None:
     assert [words.count(f"<td>{word}</td>") for word in ("yes", "held", "no")] == [1, 1, 2]
 
 
+def test_the_degrees_of_freedom_are_those_on_which_k_rests() -> None:
+    """Of files, a number alone is that of the type A part (calib.Calibration), and not that of the combined u."""
+    parts = {"sensitivity": [[30.0, None, 2e9]] + [[40.0] * 3] * 2, "offset": [50.0] * 3}
+    told = result(uncertainty_kind="combined", degrees_of_freedom=92.0, effective_degrees_of_freedom=parts)
+    np.testing.assert_array_equal(told.degrees_of_freedom, [30.0, np.nan, np.inf, *[40.0] * 6, *[50.0] * 3])
+    assert np.isnan(result(uncertainty_kind="combined", degrees_of_freedom=92.0).degrees_of_freedom).all()
+    assert (result(uncertainty_kind="type A", degrees_of_freedom=92.0).degrees_of_freedom == 92.0).all()
+    assert (result(degrees_of_freedom=[7.0] * 12).degrees_of_freedom == 7.0).all()
+
+
 def test_null_is_not_determined() -> None:
     found = result(
         sensitivity=[[10.0, None, None]] + [[None] * 3] * 2, offset=None, covariance=None,
