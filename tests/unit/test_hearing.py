@@ -81,6 +81,20 @@ def test_a_consumer_that_the_router_does_not_hear_gets_all_results_all_the_same(
     relay.close()
 
 
+def test_a_monitor_says_that_its_router_is_gone_until_it_is_back(site: Site, store: Store, tmp_path: Path) -> None:
+    publisher, fleet = Publisher("site", "gw", [site.endpoint], store), Fleet()
+    publisher.start()
+    with closing(Database(Sqlite(tmp_path / "monitor.sqlite"))) as database:
+        following = Following([site.endpoint], None, database, fleet)
+        wait_for(lambda: [gateway["alive"] for gateway in fleet.gateways({})] == [True])
+        site.kill()
+        wait_for(lambda: following.state()["fault"] == f"no Zenoh router answers at {site.endpoint}")
+        site.restart()
+        wait_for(lambda: following.state()["fault"] == "")
+        assert following.close(30.0)
+    publisher.close()
+
+
 @pytest.mark.parametrize("deaf", [1, 2], ids=["the session for results", "both sessions"])
 def test_a_monitor_that_the_router_does_not_hear_shows_the_gateway_and_its_results(
     site: Site, store: Store, tmp_path: Path, deaf: int
