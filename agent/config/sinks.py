@@ -10,8 +10,8 @@ from pydantic import AfterValidator, ByteSize, Field, model_validator
 
 from agent.config.section import Endpoint, Section
 from agent.config.tls import TlsFiles
-from hw.host import Host
 
+_HOST = re.compile(r"[^\s/\x00]{1,255}")
 _SECRET = re.compile("key|password|secret|token", re.IGNORECASE)  # searched in the part of an endpoint after '#'
 
 
@@ -21,6 +21,12 @@ def _topic(value: str) -> str:
             "a topic is one or more names with / between them, without +, # and control characters, and not $ at the "
             "front, as in fieldcal/v1"
         )
+    return value
+
+
+def _host(value: str) -> str:
+    if not _HOST.fullmatch(value):
+        raise ValueError("give the name or address alone, as in broker.example.org; the port is a setting of its own")
     return value
 
 
@@ -127,7 +133,7 @@ class Mqtt(Section):
     """How the newest results are published to an MQTT broker (MQTT 5); needs the extra `mqtt`."""
 
     enabled: bool = False
-    host: Annotated[Host, Field(description="name or address of the broker")] = "127.0.0.1"
+    host: Annotated[str, AfterValidator(_host), Field(description="name or address of the broker")] = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65535, description="8883 is usual with TLS")] = 1883
     topic: Annotated[Topic, Field(description="topics are <topic>/<site>/<gateway>/<sensor>/<what>")] = "fieldcal/v1"
     client_id: Annotated[

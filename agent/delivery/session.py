@@ -12,8 +12,8 @@ from typing import Literal
 
 import zenoh
 
+from agent.config.endpoints import endpoint_fault
 from agent.config.key_file import KeyFileError, read_private_key
-from agent.config.section import endpoint_fault
 from agent.config.tls import TlsFiles
 
 # Bytes. A block of corrected acceleration at 10 kHz takes a fifth of this; Zenoh's default limit is 1 GiB.

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from agent.cli.main import run_cli
 from agent.cli.stopping import STOP_SIGNALS
-from agent.config.section import endpoint_fault
+from agent.config.endpoints import endpoint_fault
 from agent.config.syntax import syntax_fault
 
 GOOD = """[gateway]
