@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from hw.block import BlockFlags, DeviceInfo
+from hw.host import Host
 from hw.message_sensor import OUTSIDE, MessageSensor, Piece
 from hw.mqtt_payload import Block, Json, PayloadError, Sparkplug
 from hw.sensor import ConfigurationError, DeviceLost, Options
@@ -33,7 +34,7 @@ LATEST_MS = 1e14  # the year 5138: larger stamps are no times
 class MqttOptions(Options):
     """Options of `mqtt`."""
 
-    host: str = Field(min_length=1, max_length=255, description="name or address of the broker (MQTT 5)")
+    host: Host = Field(description="name or address of the broker (MQTT 5)")
     port: int = Field(1883, ge=1, le=65535, description="its TCP port; 8883 is usual with TLS")
     topic: str = Field(
         min_length=1, max_length=1000,

@@ -8,6 +8,7 @@ from pydantic import Field, field_validator
 
 from hw import miniseed
 from hw.block import DeviceInfo
+from hw.host import Host
 from hw.seedlink_link import SeedLinkConnection
 from hw.sensor import DeviceLost, Options
 from hw.stamped_sensor import StampedSensor
@@ -19,7 +20,7 @@ UNREADABLE = "bytes that are no record of miniSEED 2"
 class SeedlinkOptions(Options):
     """Options of `seedlink`."""
 
-    host: str = Field(min_length=1, max_length=255, description="name or address of the SeedLink server")
+    host: Host = Field(description="name or address of the SeedLink server")
     port: int = Field(18000, ge=1, le=65535, description="its TCP port")
     network: str = Field("AM", pattern=r"^[A-Z0-9]{1,2}$", description="code of the network; AM is Raspberry Shake")
     station: str = Field(pattern=r"^[A-Z0-9]{1,5}$", description="code of the station, as R1234")

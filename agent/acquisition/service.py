@@ -12,6 +12,7 @@ from pathlib import Path
 
 from agent import __version__
 from agent.acquisition.arena import one_arena, return_free
+from agent.acquisition.arrival_rates import ArrivalRates
 from agent.acquisition.reader import DeviceReader, EventQueue, reader_of
 from agent.acquisition.stalls import few_objects
 from agent.acquisition.weighing import Weighing
@@ -57,7 +58,7 @@ class Service:
         self._config = config
         self._data_dir = data_dir
         self._watch = watch
-        self._weighing = Weighing(config)
+        self._weighing, self._rates = Weighing(config), ArrivalRates()
         self._stopping = False
         self._sequence = 0
         self._run_id = uuid.uuid4().hex
@@ -267,7 +268,7 @@ class Service:
         writer.put(self._sequence, event, outputs, self._pipeline.memories(outputs))
         results = [item for item in outputs if isinstance(item, Result)]
         self._watch.update(event, results)
-        for told in self._weighing.messages(event):
+        for told in (*self._weighing.messages(event), *self._rates.messages(event)):
             _log.warning("%s", told)
         if self._publisher is not None:
             for item in outputs:

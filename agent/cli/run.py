@@ -126,8 +126,15 @@ def serve(service: Service, duration_s: float | None) -> int:
     except (OtherGatewayError, ConfigurationError) as error:
         say(f"fieldcal run: {error}", err=True)
         return 2
-    except (StoreError, OSError) as error:
+    except (FileExistsError, NotADirectoryError) as error:
+        say(f"fieldcal run: {error.filename}: is no directory; name another one with --data-dir", err=True)
+        return 2
+    except StoreError as error:
         say(f"fieldcal run: {error}", err=True)
+        return 1
+    except OSError as error:
+        said = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        say(f"fieldcal run: {said}", err=True)
         return 1
     for fault in service.refused:
         say(f"fieldcal run: {fault}", err=True)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from agent.config.broker import broker_faults
 from agent.config.certified import filled_in
+from agent.config.endpoints import endpoint_fault
 from agent.config.filters import FiltersError, filters_of
 from agent.config.key_file import KeyFileError, load_private_key
 from agent.config.known_keys import read_known_keys
@@ -44,6 +45,7 @@ def faults_of(raw: Mapping[str, Any]) -> tuple[Config | None, list[Told]]:
     faults += _unknown_sensitivities(raw, dict(options))
     faults += _uncertified_references(raw, dict(options))
     faults += _no_self_tests(raw, dict(options))
+    faults += _endpoint_faults(raw)
     faults += _file_faults(raw)
     faults += _misread(raw, (), Config)
     return config, faults
@@ -144,6 +146,15 @@ def _file_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
     for fault in tls_faults(files):
         field, _, what = fault.partition(": ")
         yield ("zenoh", "tls", field), what
+
+
+def _endpoint_faults(raw: Mapping[str, Any]) -> Iterator[Told]:
+    """Endpoints of routers that have the form of one, and would connect to nothing."""
+    zenoh = raw.get("zenoh")
+    stated = zenoh.get("connect") if isinstance(zenoh, Mapping) else None
+    for i, endpoint in enumerate(stated if isinstance(stated, list) else []):
+        if isinstance(endpoint, str) and all(endpoint.partition("/")) and (fault := endpoint_fault(endpoint)):
+            yield ("zenoh", "connect", i), f"{fault}, not {_value(endpoint.partition('#')[0])}"
 
 
 def _mqtt_faults(raw: object) -> Iterator[Told]:

@@ -22,6 +22,7 @@ _ALIKE = str.maketrans(
     | dict.fromkeys("\u2212\u2013\u2014", "-")
     | dict.fromkeys("\u00a0\u2007\u2009\u202f", " ")
 )
+_VALUE_LAST = re.compile(r"""((?:[^#"']|"[^"]*"|'[^']*')*[\w}\]"'])(\s*(?:#.*)?)""")
 _NUMBER = r"[-+]?\d[\d_]*(?:\.\d+)?(?:[eE][-+]?\d+)?"
 _BEGINS, _ENDS = r"(?<=[=\[,\s])", r"(?=\s*(?:[,}\]#]|$))"  # of a value
 _MEANT = {"true": "true", "yes": "true", "on": "true", "false": "false", "no": "false", "off": "false"}
@@ -53,6 +54,7 @@ _CORRECTIONS: tuple[_Correction, ...] = (
         "true and false stand in small letters", rf"(?i)(=\s*)(true|false|yes|no|on|off){_ENDS}",
         lambda found: found[1] + _MEANT[found[2].lower()],
     ),
+    ("a line ends with its value", r"^(.*\S)\s*[;,]\s*(?:#.*)?$", r"\1"),
     ("a setting without a value is left out", r"(?i)^(.*=\s*(?:none|null|nil|~)?\s*)(?:#.*)?$", r"# \1"),
     ("a comment begins with #", r"^(\s*)(?:;|//)|(?<=\s)(?:;|//)(?=\s)", r"\1#"),
     (
@@ -80,6 +82,8 @@ def syntax_fault(text: str, error: ValueError) -> tuple[int, str]:
     for k in (number, *range(1, 0 if found and found[1] else min(number, MOST_LINES))):
         if said := _corrected(lines[k - 1]):
             return k, said
+    if (before := _without_comma(lines, number)) is not None:
+        return before, f"{_shown(lines[before - 1])}: a comma stands between two entries of a list; add it at the end"
     if (opened := _left_open(lines, number)) is not None:
         return opened, f"{_shown(lines[opened - 1])}: this bracket is not closed; close it"
     what = f"not TOML: {_shown(lines[number - 1])}: {why}" if lines[number - 1].strip() else f"not TOML: {why}"
@@ -124,6 +128,21 @@ def _twice(lines: list[str], number: int) -> str:
         what = f"state all its settings in one place; where there are several, each begins with [[{name}]]"
     first = next((k for k in range(number - 1, 0, -1) if re.match(pattern, lines[k - 1])), None)
     return f"{name} is there twice" + (f", first in line {first}" if first else "") + f"; {what}"
+
+
+def _without_comma(lines: list[str], number: int) -> int | None:
+    """The line before `number` behind whose end a comma is missing: with it, the text is read further; None if none."""
+    before = next((k for k in range(number - 1, 0, -1) if not re.match(r"\s*(?:#|$)", lines[k - 1])), None)
+    if before is None or not (found := _VALUE_LAST.fullmatch(lines[before - 1])):
+        return None
+    mended = [*lines[: before - 1], f"{found[1]},{found[2]}", *lines[before:]]
+    try:
+        tomllib.loads("\n".join(mended))
+    except (ValueError, RecursionError) as error:
+        place = _PLACE.search(str(error))
+        further = place is not None and place[1] is not None and int(place[1]) > number
+        return before if further else None
+    return before
 
 
 def _left_open(lines: list[str], until: int) -> int | None:

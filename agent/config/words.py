@@ -43,6 +43,7 @@ _IN_WORDS = {
 }
 _TABLES = ("dict_type", "model_type", "model_attributes_type")
 _A_NUMBER = re.compile(r"\s*([-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)")
+_A_UNIT = "m/s2"  # which every list of units has
 ELSEWHERE = 0.8  # how like a name of another section must be
 _SOME = 3  # places at most that are named for a setting
 
@@ -112,9 +113,20 @@ def _one_of(expected: str, value: Any) -> str:
         return words
     allowed = re.findall(r"'([^']*)'", expected)
     wanted = unicodedata.normalize("NFKC", value).strip().lower()  # m/s² is m/s2
+    if _A_UNIT in allowed:
+        return f"{words}{_unit_meant(value, wanted, allowed)}"
     near = difflib.get_close_matches(wanted, [one.lower() for one in allowed], n=1)
     found = [one for one in allowed if near and one.lower() == near[0]]
     return f"{words}; write {found[0]!r}" if found else words
+
+
+def _unit_meant(value: str, wanted: str, allowed: list[str]) -> str:
+    """The unit that was written in another way; a unit that only looks like it, as mg like g, is another one."""
+    spelt = re.sub(r"[\s^*]", "", wanted)
+    if found := [one for one in allowed if one.lower() in (spelt, spelt.removesuffix("s"))]:
+        return f"; write {found[0]!r}"
+    other = ", not {value!r}; of another unit write 'count', and state the sensitivity in that unit per m/s2"
+    return other.format(value=value) if "count" in allowed else ""
 
 
 def _annotations(kind: type[BaseModel], path: Path) -> list[Any]:

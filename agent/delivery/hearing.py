@@ -60,7 +60,7 @@ class Hearing:
         if not routers or time.monotonic() < self._next_s:
             return False
         if self._question is None:
-            self._question = _Question(self._session)
+            self._question = Question(self._session)
         if not self._question.ended():
             return False
         answered, self._question = self._question.answered, None
@@ -80,8 +80,11 @@ class Hearing:
         self._next_s = time.monotonic() + after_s * random.uniform(0.5, 1.5)
 
 
-class _Question:
-    """Asked when it is made. `answered`: False where the time was over; it holds once the question has `ended`."""
+class Question:
+    """Whether the routers read what a session sends, asked when it is made.
+
+    `answered`: False where the time was over; it holds once the question has `ended`.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.answered = True

@@ -25,6 +25,7 @@ from agent.delivery.instances import watch_own_name
 from agent.delivery.keys import gateway_key, result_key
 from agent.delivery.session import closed_in_time, session_config
 from agent.delivery.store import Store
+from agent.delivery.taken import Taken
 
 BATCH = 100  # results read from the store at a time
 POLL_S = 0.2  # s after which a router that came back is noticed; asking takes a microsecond
@@ -36,6 +37,7 @@ HEARTBEAT_S = 10.0  # s between messages that let a subscriber notice a missed l
 RECENT_MAX = 1000  # newest results; those that the store could not write are published from here
 BLOCKS_MAX = 64  # blocks of the corrected stream that may wait, half a minute of one sensor; older ones are dropped
 UNHEARD = "the router was connected and did not answer; the session was opened anew, and is not yet known to be heard"
+TAKEN_S, TAKEN_POLL_S = 0.3, 0.01  # s to wait at the end for the answer that the last results were taken; between looks
 CLOSE_S = 1.2  # s to wait at the end; a router that does not respond blocks a put for 5 s
 
 _log = logging.getLogger(__name__)
@@ -59,10 +61,11 @@ class PublicationState:
 class Publisher:
     """Publishes the results of a gateway in the order of their sequence, each after the store has it.
 
-    The store is the outbox. Zenoh does not acknowledge, so a result counts as published when it was put while a router
-    was connected. Results lost with a broken connection are still in the publisher's cache, and consumers can query
-    them (`?after=<sequence>`, see agent.delivery.answers). A session that the router does not hear is closed, and
-    another one opened (agent.delivery.hearing).
+    The store is the outbox. A result counts as published when a router is known to have taken it
+    (agent.delivery.taken). What was put before a connection broke, and is not known to be taken, is put again when a
+    router is there; so a subscriber may get a result twice. Consumers can also query results (`?after=<sequence>`, see
+    agent.delivery.answers). A session that the router does not hear is closed, and another one opened
+    (agent.delivery.hearing).
     The attachment of each sample begins with the number of the result put before it, or "0" where this number has no
     meaning: for a result that is put again at the start, or that the store could not write. A consumer that has another
     last number has missed results, or must ask. Where the gateway has a key, a line break and the signed result follow.
@@ -92,6 +95,8 @@ class Publisher:
         self._key = gateway_key(site, gateway)
         self._endpoints = tuple(connect)
         self._config = session_config(mode, connect=connect, tls=tls, one_of_many=True)
+        # One queue for each link, so that nothing overtakes a result, nor the question whether it was taken.
+        self._config.insert_json5("transport/unicast/qos/enabled", "false")
         self._tls = tls
         self._poll_s = poll_s
         self._serve_more = serve
@@ -105,11 +110,11 @@ class Publisher:
         self._fault = ""
         self._said = ""
         self._expiry, self._expiry_look_s = "", 0.0  # what is said of certificates; monotonic time of the next look
-        self._previous = store.published()
+        self._put_up_to = self._previous = store.published()  # `_previous` may be of a result that the store has not
         self._publishers: dict[str, AdvancedPublisher] = {}
         self._told: dict[str, bytes] = {}  # the newest of what the gateway says of itself, by the end of its key
         self._told_put: dict[str, bytes] = {}
-        self._hearing = Hearing()
+        self._hearing, self._taken = Hearing(), Taken()
         self._thread = threading.Thread(target=self._run, name="publication", daemon=True)
         self._other = ""  # what is said where another gateway has this name
         looking = session_config("client", connect=connect, tls=tls), self._key, self._stop, self._note_other_gateway
@@ -201,6 +206,7 @@ class Publisher:
             # undeclares it without the lock of the interpreter; its `undeclare` holds that while it waits for locks.
             open_things.callback(self._publishers.clear)
             self._hearing.begin(session)
+            self._taken.begin(session)
             for record in history.latest():
                 if record.sequence <= self._store.published():
                     self._put(session, record, previous=0)
@@ -213,6 +219,7 @@ class Publisher:
                     self._send_status(session)
                     self._send_waiting(session, history)
                     self._send_blocks(session)
+                    self._note_taken(within_s=TAKEN_S if stopping else 0.0)
                 if self._hearing.lost():
                     return
                 self._wake.wait(0 if stopping else self._poll_s)
@@ -232,7 +239,10 @@ class Publisher:
 
     def _find_router(self, session: zenoh.Session) -> bool:
         connected = bool(session.info.routers_zid())
-        if connected and not self._connected:
+        changed = self._taken.links_changed()
+        if changed:
+            self._put_up_to = self._previous = self._store.published()
+        if connected and (changed or not self._connected):
             self._stop.wait(SETTLE_S)
             if self._looks and self._name_watch.ident is None:
                 self._name_watch.start()
@@ -248,12 +258,13 @@ class Publisher:
     def _send_waiting(self, session: zenoh.Session, history: History) -> None:
         self._fault = ""
         try:
-            while records := history.after(self._store.published(), limit=BATCH):
+            while records := history.after(self._put_up_to, limit=BATCH):
                 for record in records:
                     if not session.info.routers_zid():
                         return
                     self._put(session, record, self._previous)
-                    self._store.mark_published(record.sequence)
+                    self._put_up_to = record.sequence
+                self._note_taken()
                 if self._stop.is_set() and len(records) == BATCH:
                     return  # the rest of a long backlog waits for the next run
         except StoreError as error:
@@ -262,6 +273,15 @@ class Publisher:
             record = self._recent.popleft()
             if record.sequence > self._previous:
                 self._put(session, record, previous=0)  # the number before it may be in the store only
+
+    def _note_taken(self, within_s: float = 0.0) -> None:
+        """Mark as published what the routers have taken; wait so long for their answer, where one is missing."""
+        end_s = time.monotonic() + within_s
+        while True:
+            self._store.mark_published(self._taken.up_to(self._put_up_to))
+            if self._store.published() >= self._put_up_to or time.monotonic() >= end_s:
+                return
+            time.sleep(TAKEN_POLL_S)
 
     def _send_blocks(self, session: zenoh.Session) -> None:
         while self._blocks:

@@ -12,6 +12,7 @@ from typing import Literal
 
 import zenoh
 
+from agent.config.endpoints import endpoint_fault
 from agent.config.key_file import KeyFileError, read_private_key
 from agent.config.tls import TlsFiles
 
@@ -69,6 +70,9 @@ def session_config(
         config.insert_json5("transport/unicast/max_sessions", json.dumps(ROUTER_SESSIONS))
         config.insert_json5("transport/unicast/accept_pending", json.dumps(ROUTER_ACCEPTS))
         config.insert_json5("transport/unicast/accept_timeout", json.dumps(int(ROUTER_ACCEPT_S * 1000)))
+    for endpoint in (*connect, *listen):
+        if fault := endpoint_fault(endpoint):
+            raise EndpointError(f"not an endpoint: {endpoint}: {fault}")
     for key, endpoints in (("connect/endpoints", connect), ("listen/endpoints", listen)):
         try:
             config.insert_json5(key, json.dumps(list(endpoints)))

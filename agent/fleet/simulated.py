@@ -150,7 +150,7 @@ class SimulatedGateway:
 
     @property
     def published(self) -> int:
-        """Number of the last result that was put while a router was connected."""
+        """Number of the last result that a router has taken."""
         return self._store.published()
 
     @property

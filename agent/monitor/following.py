@@ -176,7 +176,7 @@ class Following:
                 threading.Thread(target=self._take_each, args=(tokens, self._take_token), name="presence", daemon=True),
                 threading.Thread(target=self._take_each, args=(told, self._take_status), name="health", daemon=True),
                 threading.Thread(target=self._take_each, args=(guides, self._take_guide), name="guides", daemon=True),
-                threading.Thread(target=self._look, args=(consumer, ended), name="look", daemon=True),
+                threading.Thread(target=self._look, args=(consumer, session, ended), name="look", daemon=True),
             ]
             for thread in threads:
                 thread.start()
@@ -228,8 +228,10 @@ class Following:
         a = result.address
         self._fleet.take(a.site, a.gateway, a.sensor, a.what, result.fields)
 
-    def _look(self, consumer: Consumer, ended: threading.Event) -> None:
+    def _look(self, consumer: Consumer, session: zenoh.Session, ended: threading.Event) -> None:
         while not ended.wait(LOOK_S):
+            heard, where = bool(session.info.routers_zid()), ", ".join(self._endpoints)
+            self._not_received = "" if heard else f"no Zenoh router answers at {where}"
             if self._hearing.lost():
                 consumer.close()  # then both sessions are opened anew
                 return

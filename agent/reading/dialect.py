@@ -15,7 +15,7 @@ from pathlib import Path
 from agent.reading.dates import day_of, has_clock, has_day, is_moment, offset_in, order_in, order_of, seconds_of
 from agent.reading.lines import Text, text_of
 from agent.reading.source import TableError
-from calib.recorded.choice import TIME_WORDS, words
+from calib.recorded.choice import TIME_WORDS, part_of_seconds, words
 from calib.recorded.units import unit_of
 
 SAMPLE_ROWS = 50  # rows from which the dialect is found
@@ -41,6 +41,7 @@ SECOND_ROWS = frozenset(
 COUNTERS = frozenset(("counter", "packetcounter", "count", "index", "sample", "samples", "record", "scan", "no", "n"))
 THOUSANDTHS = frozenset(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"))
 _COMMENT = re.compile(COMMENT)
+_WHOLE = re.compile(r"\d{1,19}")
 _FORTRAN = re.compile(r"[+-]?(?:\d++\.?\d*+|\.\d++)[dD][+-]?\d+")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _BETWEEN_BLANKS = re.compile(r'"([^"]*)"|(\S+)')
@@ -65,8 +66,8 @@ class MixedMarksError(ValueError):
 class TableColumn:
     """A column of the table: its name and unit, and the places of the fields whose sum it is.
 
-    A date and a time of day in two columns are one, and so are a time of day and its ms. `per`: what one unit of each
-    field is in that of the column.
+    A date and a time of day in two columns are one, and so are a time of day and its ms, and seconds and their ns.
+    `per`: what one unit of each field is in that of the column.
     """
 
     name: str
@@ -335,7 +336,7 @@ def _parts(
     header: Sequence[str], units: Sequence[str], moments: Sequence[str], cells: Sequence[Sequence[str]]
 ) -> tuple[TableColumn, ...]:
     """The columns of the table. A moment is called "time" where no name tells a time."""
-    with_clock = _clocks_of_days(moments)
+    with_clock, seconds = _clocks_of_days(moments), _parts_of_seconds(header, cells)
     parts: dict[int, TableColumn] = {}
     for k, name in enumerate(header):
         places, per = [k], [1.0]
@@ -344,6 +345,8 @@ def _parts(
             places, per, name = [day, k], [1.0, 1.0], name or header[day]
         if moments[k] in ("clock", "both") and _counts_thousandths(header, cells, k):
             places, per = [*places, k + 1], [*per, 1e-3]
+        if k in seconds:
+            places, per = [k, seconds[k][0]], [1.0, seconds[k][1]]
         if k not in with_clock and name and not any(k in part.places for part in parts.values()):
             parts[k] = TableColumn(name, "s" if moments[k] else units[k], tuple(places), tuple(per))
     return tuple(_with_time(parts, moments).values())
@@ -362,6 +365,17 @@ def _clocks_of_days(moments: Sequence[str]) -> dict[int, int]:
     """The column with the time of day that belongs to each column with a day."""
     days, clocks = ([k for k, kind in enumerate(moments) if kind == which] for which in ("day", "clock"))
     return {day: clock for day in days for clock in clocks if abs(day - clock) == 1 or len(clocks) == 1}
+
+
+def _parts_of_seconds(header: Sequence[str], cells: Sequence[Sequence[str]]) -> dict[int, tuple[int, float]]:
+    """The columns of whole seconds, each with the column behind it that has their parts, and one of these in s."""
+    found = {}
+    for k, (name, behind) in enumerate(itertools.pairwise(header)):
+        per = part_of_seconds(name, behind)
+        whole = per and all(map(_WHOLE.fullmatch, (*cells[k], *cells[k + 1])))
+        if whole and all(int(part) * per < 1.0 for part in cells[k + 1]):
+            found[k] = (k + 1, per)
+    return found
 
 
 def _counts_thousandths(header: Sequence[str], cells: Sequence[Sequence[str]], clock: int) -> bool:

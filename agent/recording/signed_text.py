@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from agent.config.known_keys import KnownKeys, identifier
+from agent.config.strict_json import strict
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -42,9 +43,11 @@ class SignedText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if len(data) > largest:
             raise SignedTextError(f"more than {largest} bytes")
         try:
-            return msgspec.json.decode(data, type=SignedText)
+            signed = msgspec.json.decode(data, type=SignedText)
+            strict(data)  # two readers could take one of two texts each
         except (msgspec.DecodeError, ValueError, RecursionError) as error:
             raise SignedTextError(f"not a signed text in JSON: {error}") from None
+        return signed
 
     @property
     def json(self) -> bytes:

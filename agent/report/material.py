@@ -32,6 +32,7 @@ from agent.report.result import (
 )
 from agent.report.retraced import retrace
 from agent.report.trace import Trace
+from agent.terminal.held import is_held
 
 Kind = TypeVar("Kind")
 
@@ -119,7 +120,7 @@ def _read_result(path: Path) -> CalibrationResult:
 def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:
     chosen = _chosen(sensor, list(dict.fromkeys(name for path in paths for name in sensors_of(path))), str(paths[0]))
     recorded = read_recordings(list(paths), chosen)
-    material = _of(recorded, [_verdict(window) for window in recorded.windows], recorded.calibrations)
+    material = _of(recorded, [window_verdict(window) for window in recorded.windows], recorded.calibrations)
     material.history = list({update.made: update for update in recorded.calibrations[::-1]}.values())[::-1]
     material.files = [source_file(path) for path in paths]
     return material
@@ -143,7 +144,7 @@ def _from_directory(directory: Path, sensor: str | None) -> Material:
         status = next(iter(history.newest(chosen, "status", limit=1)), None)
         shown = [*kept, *seen, *(record for record in (in_force, status) if record is not None)]
         said = evidence(history, shown, directory)
-    windows = [_verdict(report) for report in _results(seen, WindowReport)]
+    windows = [window_verdict(report) for report in _results(seen, WindowReport)]
     wanted = list(dict.fromkeys(w.recording for w in seen if w.fields.get("used")))
     paths, lost = _present(directory, wanted[-MOST_RECORDINGS:])
     recorded = read_recordings(paths, chosen) if paths else RecordedSensor(chosen)
@@ -218,10 +219,12 @@ def _facts(recorded: RecordedSensor) -> dict[str, Any]:
     return facts
 
 
-def _verdict(window: WindowReport) -> WindowVerdict:
+def window_verdict(window: WindowReport) -> WindowVerdict:
+    """What a report says of a window of the agent."""
     return WindowVerdict(
-        window.start_s, window.stop_s, window.used, window.reason, window.points, window.left_out, window.position
-    )
+        window.start_s, window.stop_s, window.used, window.reason, window.points, window.left_out, window.position,
+        held=is_held(window),
+    )  # fmt: skip
 
 
 def _chosen(sensor: str | None, names: Sequence[str], where: str) -> str:

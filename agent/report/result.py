@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from agent.calibrate.origin import SourceFile
 from agent.config.earlier import LARGEST_VALUE
 from agent.core.events import CalibrationUpdate
 from calib.estimate.axes import axis_warnings
+from calib.excitation.windows import CALM
 from calib.model import PARAMETERS, Array
 from calib.output_unit import shown_in
 
@@ -23,14 +24,15 @@ Item = TypeVar("Item")
 Row = tuple[float | None, float | None, float | None]
 Matrix = tuple[Row, Row, Row]
 
+MANY_DEGREES = 1e6  # of freedom: as infinitely many, since k differs from 2 by less than 3e-6
 ROUNDED = 1e-6  # relative: results are written with all their digits
 PLACES = {"sensitivity": (3, 3), "offset": (3,)}
 # Members with their own place in the report. All further members of the object are shown in one more table.
 SHOWN = frozenset(
     {
         "sensitivity", "offset", "standard_uncertainty", "expanded_uncertainty", "covariance", "determined",
-        "degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows", "statistics", "options", "files",
-        "shared_errors", "response", "warnings", "unit",
+        "degrees_of_freedom", "effective_degrees_of_freedom", "nuisances", "budget", "status", "reasons", "windows",
+        "statistics", "options", "files", "shared_errors", "response", "warnings", "unit",
     }
 )  # fmt: skip
 
@@ -40,7 +42,10 @@ class ResultError(ValueError):
 
 
 class WindowVerdict(msgspec.Struct, frozen=True):
-    """One window: its times in seconds since the first sample, and whether it was used or why not."""
+    """One window: its times in seconds since the first sample, and whether it was used or why not.
+
+    `held`: it was not used, and further windows might have confirmed it; files have no such windows.
+    """
 
     start_s: float
     stop_s: float
@@ -50,6 +55,14 @@ class WindowVerdict(msgspec.Struct, frozen=True):
     left_out: int = 0
     position: str = ""
     kind: str = ""
+    held: bool = False
+
+    @property
+    def verdict(self) -> Literal["used", "held", "calm", "refused"]:
+        """What became of it."""
+        if self.used or self.held:
+            return "used" if self.used else "held"
+        return "calm" if self.kind == "quiet" or self.reason == CALM else "refused"
 
 
 class ThirdOctave(msgspec.Struct, frozen=True):
@@ -175,7 +188,7 @@ def parse(fields: Mapping[str, Any], name: str) -> CalibrationResult:
         coverage_factor=factor,
         covariance=covariance,
         determined=np.append(*_parts(fields.get("determined"), "determined.")) == 1.0,
-        degrees_of_freedom=_freedom(fields.get("degrees_of_freedom")),
+        degrees_of_freedom=_freedom(fields),
         lag_s=np.nan_to_num(_array(fields.get("lag_s"), (3,), "lag_s")),
         refused=fields["status"] != "valid",
         reasons=tuple(str(reason) for reason in fields.get("reasons") or ()),
@@ -308,10 +321,20 @@ def _array(value: Any, shape: tuple[int, ...], where: str) -> Array:
     return np.broadcast_to(array, shape).copy()
 
 
-def _freedom(value: Any) -> Array:
-    if isinstance(value, Mapping):
-        return np.append(*_parts(value, "degrees_of_freedom."))
-    return _array(value, (12,), "degrees_of_freedom")
+def _freedom(fields: Mapping[str, Any]) -> Array:
+    """The effective degrees of freedom (12,), on which the coverage factor rests; NaN where they are not told.
+
+    Of an adjustment of files, `degrees_of_freedom` is a number: that of the type A part alone.
+    """
+    name = "effective_degrees_of_freedom"
+    value = fields.get(name)
+    if value is None:
+        name = "degrees_of_freedom"
+        value = fields.get(name)
+        if fields.get("uncertainty_kind") == "combined" and isinstance(value, int | float):
+            value = None
+    told = np.append(*_parts(value, f"{name}.")) if isinstance(value, Mapping) else _array(value, (12,), name)
+    return np.where(told > MANY_DEGREES, np.inf, told)
 
 
 def _source(value: Any, where: str) -> Array:

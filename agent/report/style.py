@@ -17,6 +17,7 @@ WIDTH_IN = 5.0  # 480 px: on a phone of 360 px the 10 pt letters are still 9 px 
 ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}  # of a legend, over the axes
 INK, PALE, PAPER = "#1b1e23", "#c9ced6", "#ffffff"
 USED, REFUSED = "#2a7f62", "#b3431b"
+HELD = "#b58b00"  # one of the shades
 AXIS_COLOURS = ("#0068b5", "#c2500a", "#00805e")  # x, y, z; colour-blind people can distinguish them too
 RESULT_COLOURS = ("#0068b5", "#c2500a", "#00805e", "#8f4f9f", "#7a6a00", "#5a6472")
 RESULT_MARKERS = "osD^vP"

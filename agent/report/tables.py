@@ -98,7 +98,7 @@ def windows(result: CalibrationResult) -> str:
             f"{w.start_s:.2f}",
             f"{w.stop_s:.2f}",
             position_name(w.position),
-            "yes" if w.used else "no",
+            {"used": "yes", "held": "held"}.get(w.verdict, "no"),
             str(w.points),
             str(w.left_out),
             w.reason,

@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from agent.core.events import CalibrationUpdate
 from agent.report.result import CalibrationResult, WindowVerdict
-from agent.report.style import INK, PALE, REFUSED, SHADES, USED, bare, figure, series
+from agent.report.style import HELD, INK, PALE, REFUSED, SHADES, USED, bare, figure, series
 from agent.report.units import offset_unit, position_name
 from agent.terminal.text import figure_text
 from calib.model import PARAMETERS
@@ -20,7 +20,7 @@ from calib.output_unit import shown_in
 LANES = 16  # a figure has room for so many positions; if there are more, windows are arranged by verdict
 MAIN = [0, 4, 8]
 SOURCES = 7  # so many of the largest sources are named; the others are added up
-CALM = "the reference is calm here"
+COLOURS = {"used": USED, "held": HELD, "refused": REFUSED, "calm": PALE}  # by verdict
 
 
 def windows(verdicts: Sequence[WindowVerdict]) -> Figure | None:
@@ -34,26 +34,18 @@ def windows(verdicts: Sequence[WindowVerdict]) -> Figure | None:
     axes = drawn.subplots()
     for w in verdicts:
         lane = lanes.index(w.position) if by_position else int(not w.used)
-        axes.barh(
-            lane, w.stop_s - w.start_s, left=w.start_s, height=0.6, color=_colour(w), edgecolor=INK, linewidth=0.5
-        )
+        colour = COLOURS[w.verdict]
+        axes.barh(lane, w.stop_s - w.start_s, left=w.start_s, height=0.6, color=colour, edgecolor=INK, linewidth=0.5)
     labels = [figure_text(_short(position_name(name))) for name in lanes]
     axes.set(yticks=range(len(lanes)), yticklabels=labels, xlabel="time in s")
     axes.set_ylim(len(lanes) - 0.4, -0.6)
     axes.set_ylabel("position" if by_position else "")
     axes.margins(x=0.02)
     bare(axes)
-    kinds = {"used": USED, "refused": REFUSED, "calm": PALE}
-    present = {_colour(w) for w in verdicts}
-    handles = [Patch(facecolor=c, edgecolor=INK, linewidth=0.5, label=n) for n, c in kinds.items() if c in present]
-    drawn.legend(handles=handles, loc="outside upper right", ncols=3)
+    present = {w.verdict for w in verdicts}
+    handles = [Patch(facecolor=c, edgecolor=INK, linewidth=0.5, label=n) for n, c in COLOURS.items() if n in present]
+    drawn.legend(handles=handles, loc="outside upper right", ncols=4)
     return drawn
-
-
-def _colour(window: WindowVerdict) -> str:
-    if window.used:
-        return USED
-    return PALE if window.kind == "quiet" or window.reason == CALM else REFUSED
 
 
 def _short(name: str) -> str:

@@ -24,7 +24,7 @@ from calib.recorded.certificate import ReferenceCertificate
 from calib.recorded.measurement_result import NuisanceValue
 from calib.recorded.narrower import Band, band_below_gap, narrower_bands
 from calib.recorded.options import Options
-from calib.recorded.outcome import Outcome, nothing_used
+from calib.recorded.outcome import Outcome, nothing_used, parts_of
 from calib.recorded.priors import priors_of, row_contradictions, u_gravity_mps2
 from calib.recorded.table import SensorTable
 from calib.recorded.tables import Tables
@@ -475,6 +475,7 @@ def _outcome(found: Adjustment, windows: Sequence[Window], rate_hz: float, devia
             "budget": {
                 source: dict(zip(PARAMETERS, u, strict=True)) for source, u in found.contributions.items() if u.any()
             },
+            "effective_degrees_of_freedom": parts_of(found.grounds.shares.degrees_of_freedom),
             "chi2": found.chi2,
             "chi2_degrees_of_freedom": found.chi2_degrees_of_freedom,
             "offset_scatter_mps2": found.offset_scatter_mps2,

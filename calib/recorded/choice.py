@@ -31,6 +31,13 @@ _COMPASS = {
     "x": re.compile(r"e|ew|we|east|[a-z][hlng]e"), "y": re.compile(r"n|ns|sn|north|[a-z][hlng]n"),
     "z": re.compile(r"z|u|ud|up|vert|vertical|[a-z][hlng]z"),
 }  # fmt: skip
+# Two columns of one time, as ROS and C write it: whole seconds, and their parts.
+_WHOLE_SECONDS = frozenset(["sec", "secs", "second", "seconds"])
+_PARTS_OF_SECONDS = {
+    word: scale
+    for scale, told in ((1e-3, "m milli"), (1e-6, "u micro"), (1e-9, "n nano"))
+    for prefix in told.split() for word in (f"{prefix}{unit}" for unit in _WHOLE_SECONDS)
+}  # fmt: skip
 _ENDS = ("ew", "we", "ns", "sn", "ud")  # of a line, where they are two words: N-S
 Result = TypeVar("Result")
 
@@ -164,6 +171,8 @@ class Choice:
                 raise self.fault(f"column {candidate!r} is in several groups ({groups}), add group=NAME")
             if found and unit and unit_of(unit) is None:
                 raise self.unknown(unit, candidate)
+            if found and word == "time":
+                self._check_whole(found[0])
             if found:
                 return ChosenColumn(found[0], unit or _unit(found[0]))
         raise self.fault(f"there is no column {name!r}")
@@ -195,7 +204,16 @@ class Choice:
         found = [self._compass[role]] if role in self._compass else [c for c in self._columns if _role(c) == role]
         if len(found) > 1:
             raise self.fault(f"several columns could be {role}: {', '.join(repr(str(c)) for c in found)}")
+        if found and role == "time":
+            self._check_whole(found[0])
         return ChosenColumn(found[0], _unit(found[0])) if found else None
+
+    def _check_whole(self, time: Column) -> None:
+        """Raise InputError where another column has the parts of this one's seconds."""
+        parts = [c for c in self._columns if c.group == time.group and part_of_seconds(time.name, c.name)]
+        if parts:
+            what = f"{str(time)!r} has whole seconds, and {str(parts[0])!r} their parts"
+            raise InputError(what, "write the sum of both in one column, in s", place=self.place)
 
     @property
     def _compass(self) -> dict[str, Column]:
@@ -259,6 +277,14 @@ def _way(column: Column) -> str:
 def words(name: str) -> list[str]:
     """The words and numbers of a column's name, in lower case."""
     return re.findall(r"[a-z]+|\d+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
+
+
+def part_of_seconds(whole: str, part: str) -> float:
+    """How many s are one unit of the column `part`, where by their names it has the parts of the seconds in the column
+    `whole`; otherwise 0."""
+    first, second = words(whole), words(part)
+    alike = bool(first) and bool(second) and first[:-1] == second[:-1] and first[-1] in _WHOLE_SECONDS
+    return _PARTS_OF_SECONDS.get(second[-1], 0.0) if alike else 0.0
 
 
 def _role(column: Column) -> str:

@@ -67,13 +67,13 @@ def as_json(outcome: Outcome) -> str:
 def as_object(outcome: Outcome) -> dict[str, Any]:
     """The members of the JSON object: those that every outcome has, then those of the method."""
     c = outcome.calibration
-    expanded = _parts(outcome.expanded_uncertainty)
+    expanded = parts_of(outcome.expanded_uncertainty)
     return {
-        **_parts(outcome.values),
-        "standard_uncertainty": _parts(outcome.standard_uncertainty),
+        **parts_of(outcome.values),
+        "standard_uncertainty": parts_of(outcome.standard_uncertainty),
         "expanded_uncertainty": {**expanded, "coverage_factor": outcome.coverage_factor},
         "covariance": outcome.covariance,
-        "determined": _parts(outcome.determined),
+        "determined": parts_of(outcome.determined),
         "nuisances": {
             n.name: {"value": n.value, "standard_uncertainty": n.standard_uncertainty, "unit": n.unit}
             for n in outcome.nuisances
@@ -96,8 +96,8 @@ def as_object(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _parts(values: Array | np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, Any]:
-    """S and Q from (12,) in the order of calib.model.PARAMETERS."""
+def parts_of(values: Array | np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, Any]:
+    """S and Q from (12,), as the JSON object has them, in the order of calib.model.PARAMETERS."""
     return {"sensitivity": values[:9].reshape(3, 3), "offset": values[9:]}
 
 

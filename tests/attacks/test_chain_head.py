@@ -128,3 +128,12 @@ def test_the_head_is_written_at_the_beginning_and_never_ahead_of_the_disk(tmp_pa
     length = int(text.partition("opening ")[2].split()[0])
     assert 0 < length < files[-1].stat().st_size
     assert KEY.public_key().public_bytes_raw().hex()
+
+
+@pytest.mark.parametrize("name", ["text", "public_key", "signature"])
+def test_a_head_that_two_readers_could_read_in_two_ways_is_none(name: str) -> None:
+    whole = SignedText("a", "b", "c")
+    twice = b'{"' + name.encode() + b'":"another",' + whole.json[1:]
+    assert SignedText.read(whole.json) == whole
+    with pytest.raises(SignedTextError, match=f"not a signed text in JSON: the key '{name}' is there twice"):
+        SignedText.read(twice)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from hw.block import BlockFlags, Drop, SampleBlock
 from hw.conformance.network import NetworkRig
@@ -288,3 +289,10 @@ def test_a_real_broker_with_a_password_comes_and_goes(tmp_path: Path) -> None:
         publisher.disconnect()
         broker.terminate()
         broker.wait(60)
+
+
+@pytest.mark.parametrize("host", ["mqtt://broker.example.org", "broker.example.org:1883", "a broker"])
+def test_a_host_is_a_name_or_an_address_alone(host: str) -> None:
+    with pytest.raises(ValidationError, match="give the name or address alone"):
+        MqttOptions(host=host, topic="a", rate_hz=100.0)
+    assert MqttOptions(host="2001:db8::1", topic="a", rate_hz=100.0).host == "2001:db8::1"

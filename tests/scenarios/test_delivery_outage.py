@@ -58,8 +58,9 @@ def test_a_frozen_router_holds_nobody_up_and_loses_nothing(tmp_path: Path) -> No
         os.kill(frozen.pid, signal.SIGSTOP)
         count = 1000
         gateway.send(count, size=20_000, pause_s=FREEZE_S / (count / 10))
-        last, longest_s, _ = gateway.sent()
+        last, longest_s, published = gateway.sent()
         assert longest_s < 2.0  # a put waits for 5 s
+        assert published == gateway.begin + 10, "what a frozen router has not taken is not published"
         os.kill(frozen.pid, signal.SIGCONT)
         gateway.send(10)
         last, _, _ = gateway.sent()

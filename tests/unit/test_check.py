@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from agent.cli.main import run_cli
 from agent.cli.stopping import STOP_SIGNALS
+from agent.config.endpoints import endpoint_fault
 from agent.config.syntax import syntax_fault
 
 GOOD = """[gateway]
@@ -174,6 +175,19 @@ sensitivity = 1670.7
 """
 
 
+@pytest.mark.parametrize("name", ["notes.txt", "notes.txt/data"])
+def test_a_data_directory_that_is_a_file_is_named_with_the_remedy(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "f.toml").write_text(GOOD, "utf-8")
+    (tmp_path / "notes.txt").write_text("mine", "utf-8")
+    arguments = ["run", str(tmp_path / "f.toml"), "--data-dir", str(tmp_path / name), "--duration", "0.1"]
+    assert run_cli([*arguments, "--log", "plain"]) == 2
+    told = f"fieldcal run: {tmp_path / name}: is no directory; name another one with --data-dir\n"
+    assert told in capsys.readouterr().err
+    assert (tmp_path / "notes.txt").read_text("utf-8") == "mine"
+
+
 @pytest.mark.parametrize("bus", [250, 251])
 def test_a_part_that_answers_for_others_and_is_not_alone(
     bus: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -227,6 +241,22 @@ def test_a_part_that_answers_for_others_and_is_not_alone(
             "(1/9.80665), or its certificate's",
         ),
         (
+            "axes = 1",
+            'axes = 1\nunit = "mg"',
+            "line 14: devices.1.options.unit: must be 'count', 'm/s2', 'g', 'm/s' or 'mV', not 'mg'; of another unit "
+            "write 'count', and state the sensitivity in that unit per m/s2",
+        ),
+        (
+            "axes = 1",
+            'axes = 1\nunit = "m/s^2"',
+            "line 14: devices.1.options.unit: must be 'count', 'm/s2', 'g', 'm/s' or 'mV'; write 'm/s2', not 'm/s^2'",
+        ),
+        (
+            "keep_days = 30",
+            'keep_days = 30;',
+            "line 25: keep_days = 30;: a line ends with its value; write keep_days = 30",
+        ),
+        (
             "keep_days = 30",
             "keep_days = ",
             "line 25: keep_days =: a setting without a value is left out; write # keep_days =",
@@ -239,6 +269,43 @@ def test_a_fault_names_line_path_and_remedy(
     lines = checked(tmp_path / "f.toml", GOOD.replace(said, instead, 1), capsys)
     assert lines[0] == told
     assert not [line for line in lines if re.search(r"[\[^]\^|\\\$|\{0,", line)], "a regular expression is no help"
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "told"),
+    [
+        ("tcp://192.0.2.1:7447", "write tcp/192.0.2.1:7447: one slash stands behind the protocol"),
+        ("192.0.2.1:7447", "an endpoint is a protocol, a slash and an address, as in tcp/192.0.2.1:7447"),
+        ("tcp/192.0.2.1", "the address is a host, a colon and a port of 65535 at most, as in tcp/192.0.2.1:7447"),
+        ("tcp/192.0.2.1:74470", "the address is a host, a colon and a port of 65535 at most, as in tcp/192.0.2.1:7447"),
+        ("tcp/192.0.2.1:7447/", "the address is a host, a colon and a port of 65535 at most, as in tcp/192.0.2.1:7447"),
+        ("tcp/:7447", "the address is a host, a colon and a port of 65535 at most, as in tcp/192.0.2.1:7447"),
+        ("TCP/192.0.2.1:7447", "Zenoh has no protocol 'TCP', but tcp, udp, tls, quic, quic_datagram, ws, serial, "
+         "unixsock-stream, unixpipe, vsock"),
+        ("tcp/[2001:db8::1]:7447?rel=1", ""),
+        ("tls/router.example.org:7447#a=b", ""),
+        ("unixsock-stream//run/zenoh", ""),
+    ],
+)  # fmt: skip
+def test_an_endpoint_that_would_connect_to_nothing_is_a_fault(endpoint: str, told: str) -> None:
+    assert endpoint_fault(endpoint) == told
+
+
+COMMA = "a comma stands between two entries of a list; add it at the end"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x = [\n  { a = 1 }\n  { a = 2 },\n]\n", (2, "{ a = 1 }: " + COMMA)),
+        ("x = [\n  1, # b\n  2 # c\n\n  3,\n]\ny = 4\n", (3, "2 # c: " + COMMA)),
+        ("x = [\n  1,\n  2\ny = 4\n", (1, "x = [: this bracket is not closed; close it")),
+    ],
+)  # fmt: skip
+def test_a_list_without_a_comma_or_its_end(text: str, told: tuple[int, str]) -> None:
+    with pytest.raises(tomllib.TOMLDecodeError) as refused:
+        tomllib.loads(text)
+    assert syntax_fault(text, refused.value) == told
 
 
 def test_a_device_that_tells_m_per_s2_needs_no_sensitivity(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

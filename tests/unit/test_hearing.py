@@ -52,13 +52,14 @@ def test_a_gateway_that_the_router_does_not_hear_comes_back_to_the_bus(
     store.commit([record(1), record(2)])
     for number in (1, 2):
         publisher.publish(record(number))
-    wait_for(lambda: store.published() == 2)  # so it seems
     with site.client() as client, Consumer([site.endpoint], last_sequence={"site/gw": 0}) as consumer:
         assert not on_the_bus(client)
         with caplog.at_level(logging.WARNING, "agent.delivery.hearing"):
-            wait_for(lambda: on_the_bus(client))
+            wait_for(lambda: on_the_bus(client) or store.published() > 0)
+        assert on_the_bus(client), "nothing is published before the router hears the gateway"
         assert [result.sequence for result in taken_until(consumer, lambda r: r.sequence == 2)] == [1, 2]
         wait_for(lambda: publisher.state().connected and not publisher.state().fault)
+    wait_for(lambda: store.published() == 2)
     assert publisher.state().reopened == 1
     assert "has not answered for 1 s" in caplog.text
     publisher.close()
@@ -78,6 +79,21 @@ def test_a_consumer_that_the_router_does_not_hear_gets_all_results_all_the_same(
     assert len(relay.accepted_s) == 2
     publisher.close()
     relay.close()
+
+
+@pytest.mark.slow
+def test_a_monitor_says_that_its_router_is_gone_until_it_is_back(site: Site, store: Store, tmp_path: Path) -> None:
+    publisher, fleet = Publisher("site", "gw", [site.endpoint], store), Fleet()
+    publisher.start()
+    with closing(Database(Sqlite(tmp_path / "monitor.sqlite"))) as database:
+        following = Following([site.endpoint], None, database, fleet)
+        wait_for(lambda: [gateway["alive"] for gateway in fleet.gateways({})] == [True])
+        site.kill()
+        wait_for(lambda: following.state()["fault"] == f"no Zenoh router answers at {site.endpoint}")
+        site.restart()
+        wait_for(lambda: following.state()["fault"] == "")
+        assert following.close(30.0)
+    publisher.close()
 
 
 @pytest.mark.slow
@@ -132,6 +148,6 @@ def test_a_router_answers_whatever_its_access_rules() -> None:
         (endpoint,) = json.loads(told.ok.payload.to_string())["locators"]
         with zenoh.open(session_config("client", connect=[endpoint])) as session:
             for _ in range(hearing.MISSES):
-                question = hearing._Question(session)
+                question = hearing.Question(session)
                 wait_for(question.ended)
                 assert question.answered

@@ -15,6 +15,7 @@ import pytest
 
 from agent.cli.main import run_cli
 from calib import Calibration, InputError, calibrate
+from calib.distributions import coverage_factor
 from calib.recorded.errors import OptionError
 from calib.recorded.options import DEFAULTS, Options
 from calib.recorded.outcome import Outcome
@@ -138,6 +139,8 @@ FAULTS: list[tuple[Callable[[], Outcome], tuple[str, int | None, str], str]] = [
     (lambda: calibrate(SENSOR | {"vz": ["x"] * 11982}), ("sensor", 0, "vz"), "'x'.* is no number"),
     (lambda: calibrate(SENSOR | {"vz": 1j * SENSOR["vz"]}), ("sensor", 0, "vz"), "is no number"),
     (lambda: calibrate(np.ones((5, 3))), ("sensor", None, ""), "there are 3 columns; give 4: time_s, vx, vy, vz"),
+    (lambda: calibrate({"secs": [1, 1], "nsecs": [0, 5]} | {k: [0.0, 1.0] for k in "xyz"}), ("sensor", None, ""),
+     "'secs' has whole seconds, and 'nsecs' their parts.*write the sum of both in one column"),
     (lambda: calibrate("sensor.csv"), ("sensor", None, ""), "str is no table; give a DataFrame"),
     (lambda: calibrate(SENSOR, REFERENCE | {"v": REFERENCE["a"]}, POSES), ("reference", None, ""), "give one of"),
     (lambda: calibrate(SENSOR, REFERENCE, posed(2, stop_s=1.0)), ("poses", 2, "stop_s"), "1 is not after start_s 20"),
@@ -170,6 +173,12 @@ def test_a_value_that_is_missing_is_a_gap(result: Outcome) -> None:
     with_gaps = calibrate(SENSOR | {"vx": masked}, REFERENCE, POSES, **OPTIONS)
     assert with_gaps.to_json() == calibrate(as_nan, REFERENCE, POSES, **OPTIONS).to_json() != result.to_json()
     assert with_gaps.status == "valid"
+
+
+def test_the_coverage_factor_rests_on_the_fewest_effective_degrees_of_freedom(result: Outcome) -> None:
+    told = json.loads(result.to_json())["effective_degrees_of_freedom"]
+    freedom = np.append(np.array(told["sensitivity"], dtype=float), np.array(told["offset"], dtype=float))
+    assert result.coverage_factor == pytest.approx(coverage_factor(freedom[result.determined].min()), rel=1e-12)
 
 
 def test_dates_are_times(result: Outcome) -> None:

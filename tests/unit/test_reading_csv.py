@@ -52,6 +52,14 @@ def epoch(per_second: int) -> str:
     )
 
 
+def in_two(per_second: int) -> str:
+    """Whole seconds, and their parts in the next column."""
+    ticks = [(round(row[0] * per_second), row[1:]) for row in VALUES]
+    return "".join(
+        f"{START_S + t // per_second},{t % per_second},{','.join(f'{x:.4f}' for x in row)}\n" for t, row in ticks
+    )
+
+
 HEADER = "time_s,vx,vy,vz\n"
 SENSORS: dict[str, str | bytes] = {
     "plain": HEADER + table(),
@@ -94,6 +102,8 @@ DATED: dict[str, str] = {
     "ms since 1970": "timestamp,x,y,z\n" + epoch(10**3),
     "us since 1970": "timestamp,x,y,z\n" + epoch(10**6),
     "ns since 1970": "timestamp,x,y,z\n" + epoch(10**9),
+    "secs and nsecs": "secs,nsecs,x,y,z\n" + in_two(10**9),
+    "stamps of ROS 2": "header.stamp.sec,header.stamp.nanosec,accel.x,accel.y,accel.z\n" + in_two(10**9),
 }  # fmt: skip
 
 
@@ -111,6 +121,12 @@ def test_sensors(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.v[:], VALUES[:, 1:])
     told = "vx" not in str(SENSORS[kind])[:100] and kind != "UTF-16 of Excel"
     assert bool(found.said) == (told or kind == "UTF-16 of Excel" or "decimal commas" in kind)
+
+
+def test_seconds_and_their_parts_that_are_stated(tmp_path: Path) -> None:
+    text = "n,tv_sec,tv_usec,x,y,z\n" + "".join(f"{k},{line}\n" for k, line in enumerate(in_two(10**6).split()))
+    found = read_sensor(written(tmp_path, text), columns="time=tv_sec,x=x,y=y,z=z")
+    np.testing.assert_allclose(found.time_s[:], START_S + VALUES[:, 0], rtol=0, atol=2.5e-7)
 
 
 @pytest.mark.slow

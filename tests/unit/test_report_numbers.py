@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
-from agent.report import tables
+from agent.report import tables, timelines
 from agent.report.frequencies import over_frequency, response
+from agent.report.material import window_verdict
 from agent.report.result import CalibrationResult, ResultError, from_update, parse
 from agent.report.timelines import SOURCES, variance_shares
 from agent.report.trace import PHASE_BINS, Trace, by_phase, residuals, spans, spectrum
@@ -17,7 +19,7 @@ from agent.report.units import in_words, output_unit, sensitivity_unit
 from calib.geometry import along, clamp
 from calib.model import PARAMETERS
 from calib.rounding import plus_minus
-from tests.unit.results import calibration
+from tests.unit.results import calibration, window
 
 S = np.array([[10.0, -0.1, 0.05], [0.2, 9.9, 0.1], [-0.1, 0.15, 10.2]])
 Q = np.array([0.3, -0.5, 0.1])
@@ -65,6 +67,41 @@ def test_the_response_is_told_in_per_cent_of_s_and_as_numbers() -> None:
     assert f"<td>2 to 8</td><td>{plus_minus(np.hypot(1.1, 0.2) * S[0, 0], 0.02)}</td>" in tables.over_frequency(found)
     assert response(found) is not None
     assert response(result(response=bands[1:])) is None
+
+
+def test_a_held_window_is_neither_used_nor_refused() -> None:
+    numbers = {"innovation_chi2": 90.0, "innovation_chi2_threshold": 30.0}
+    told = [
+        {"start_s": 0.0, "used": True, "numbers": numbers},
+        {"start_s": 5.0, "used": False, "reason": "held until further windows confirm a jump", "numbers": numbers},
+        {"start_s": 9.0, "used": False, "reason": "the reference is calm here", "numbers": {}},
+        {"start_s": 12.0, "used": False, "reason": "the sensor does not follow", "numbers": {}},
+    ]
+    reports = [msgspec.structs.replace(window(1), **fields) for fields in told]
+    verdicts = [window_verdict(report) for report in reports]
+    assert [verdict.verdict for verdict in verdicts] == ["used", "held", "calm", "refused"]
+    drawn = timelines.windows(verdicts)
+    assert drawn is not None
+    assert [text.get_text() for text in drawn.legends[0].get_texts()] == ["used", "held", "refused", "calm"]
+    bars = [bar.get_facecolor() for bar in drawn.axes[0].patches]
+    assert len(set(bars)) == 4
+    patches = {
+        text.get_text(): patch.get_facecolor()
+        for patch, text in zip(drawn.legends[0].get_patches(), drawn.legends[0].get_texts(), strict=True)
+    }
+    assert [patches[verdict.verdict] for verdict in verdicts] == bars
+    words = tables.windows(replace(result(), windows=tuple(verdicts)))
+    assert [words.count(f"<td>{word}</td>") for word in ("yes", "held", "no")] == [1, 1, 2]
+
+
+def test_the_degrees_of_freedom_are_those_on_which_k_rests() -> None:
+    """Of files, a number alone is that of the type A part (calib.Calibration), and not that of the combined u."""
+    parts = {"sensitivity": [[30.0, None, 2e9]] + [[40.0] * 3] * 2, "offset": [50.0] * 3}
+    told = result(uncertainty_kind="combined", degrees_of_freedom=92.0, effective_degrees_of_freedom=parts)
+    np.testing.assert_array_equal(told.degrees_of_freedom, [30.0, np.nan, np.inf, *[40.0] * 6, *[50.0] * 3])
+    assert np.isnan(result(uncertainty_kind="combined", degrees_of_freedom=92.0).degrees_of_freedom).all()
+    assert (result(uncertainty_kind="type A", degrees_of_freedom=92.0).degrees_of_freedom == 92.0).all()
+    assert (result(degrees_of_freedom=[7.0] * 12).degrees_of_freedom == 7.0).all()
 
 
 def test_null_is_not_determined() -> None:

@@ -168,7 +168,7 @@ def test_rests_alone_and_merged_records_have_budgets_as_well(clamped: list[Recor
 def test_the_first_calibration_of_a_day_and_an_adopted_jump_have_a_budget() -> None:
     """Also after a restart in between; the squares are those of U in force."""
     random = np.random.default_rng(14)
-    found = settled(random)  # ten windows, one an hour
+    found = settled()  # ten windows, one an hour
     assert found.budget is None
     went_on = estimation()
     went_on.load(unpack(pack(found.snapshot())))
