@@ -307,8 +307,9 @@ def _clocks(watch: SiteWatch, sensors: list[SensorVerdict]) -> None:
 
 def _excited(watch: SiteWatch, tests: Tests, i: int, told: SensorVerdict, limit: float) -> SensorVerdict:
     """What sensor `i` is told of; or that it is excited otherwise, where quiet and loud hours differ by another amount
-    since then, on any axis. A sensitivity changes all hours alike, and damage nearly so."""
-    if told.kind not in ("sensitivity", "one of two", "sensor or structure"):
+    since then, on any axis. A sensitivity changes all hours alike, and damage nearly so. Bands that change differently
+    are told as that: outputs that are exchanged change their hours as well."""
+    if told.kind not in ("sensitivity", "one of two"):
         return told
     begins = watch.contrasts.begins
     which = [k for k in _begins(watch) if begins[k] >= told.earliest - FEWEST_SINCE]
