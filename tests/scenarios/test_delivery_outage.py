@@ -44,6 +44,12 @@ def test_ten_thousand_results_wait_for_a_router_that_was_killed(tmp_path: Path) 
         assert numbers(received) == list(range(gateway.begin + 1, gateway.begin + 10 + OUTAGE + 1))
 
 
+def published_by(gateway: Gateway) -> int:
+    """The last number that the gateway takes for published."""
+    gateway.send(0)
+    return gateway.sent()[2]
+
+
 @pytest.mark.slow
 def test_a_frozen_router_holds_nobody_up_and_loses_nothing(tmp_path: Path) -> None:
     endpoint, received = free_endpoint(), tmp_path / "received"
@@ -55,6 +61,7 @@ def test_a_frozen_router_holds_nobody_up_and_loses_nothing(tmp_path: Path) -> No
         gateway.send(10)
         gateway.sent()
         wait_until(lambda: len(numbers(received)) == 10, 60, "the first results arrive")
+        wait_until(lambda: published_by(gateway) == gateway.begin + 10, 60, "the gateway knows that they are taken")
         os.kill(frozen.pid, signal.SIGSTOP)
         count = 1000
         gateway.send(count, size=20_000, pause_s=FREEZE_S / (count / 10))

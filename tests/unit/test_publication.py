@@ -291,11 +291,9 @@ def test_an_endpoint_that_is_none_is_refused(store: Store) -> None:
         Publisher("site", "gw", ["router7447"], store)
 
 
-def test_an_endpoint_of_an_unknown_protocol_is_a_fault_that_is_told(store: Store) -> None:
-    publisher = Publisher("site", "gw", ["carrier/pigeon:1"], store)
-    publisher.start()
-    wait_for(lambda: "carrier" in publisher.state().fault)
-    publisher.close()
+def test_an_endpoint_of_an_unknown_protocol_is_refused(store: Store) -> None:
+    with pytest.raises(EndpointError, match="Zenoh has no protocol 'carrier'"):
+        Publisher("site", "gw", ["carrier/pigeon:1"], store)
 
 
 def test_a_certificate_that_is_about_to_expire_is_told_while_the_gateway_runs(
