@@ -114,7 +114,7 @@ REFUSED = [  # what an intruder would try, and what it ends with
     ("import os; os.stat('/proc/1')", "No such file"),
     ("import socket; socket.socket(socket.AF_PACKET, socket.SOCK_RAW)", "Address family not supported"),
     (NEW_NAMESPACE, "PermissionError"),
-    ("import os; print(os.listdir('/home'), os.listdir('/root/.ssh'))", "No such file"),
+    ("import os, pwd; print(os.listdir('/home'), os.listdir(pwd.getpwuid(0).pw_dir + '/.ssh'))", "No such file"),
 ]  # fmt: skip
 TRIES = """
 import json
