@@ -2,7 +2,7 @@
 
     python -m benchmarks.site_watch --sensors 8 [--cases 160] [--write]
     python -m benchmarks.site_watch --sensors 8 --years 60 [--write]
-    python -m benchmarks.site_watch --traffic [--cases 80] [--write]
+    python -m benchmarks.site_watch --traffic [--cases 80] [--first-site 10] [--write]
     python -m benchmarks.site_watch --worlds [--write]
     python -m benchmarks.site_watch --cost [--write]
     python -m benchmarks.site_watch --kept [--write]
@@ -231,10 +231,11 @@ def sound(seed: int, sensors: int, count: Counter[str]) -> None:
     count["days"] += SITE_DAYS - FIRST_LOOK
 
 
-def traffic(cases: int, end: float) -> str:
-    """What is told of changes of the excitation alone, on any of TRAFFIC_DAYS after them, at 8 sensors."""
+def traffic(cases: int, end: float, first: int = 0) -> str:
+    """What is told of changes of the excitation alone, on any of TRAFFIC_DAYS after them, at 8 sensors, from site
+    `first` on."""
     count: Counter[tuple[str, str]] = Counter()
-    for seed in range(-(-cases // TRAFFIC_OF_A_SITE)):
+    for seed in range(first, first - (-cases // TRAFFIC_OF_A_SITE)):
         if time.monotonic() > end:
             break
         bridge, watch = learned(1000 + seed, 8, World())
@@ -563,6 +564,7 @@ if __name__ == "__main__":
     parser.add_argument("--years", type=float, default=0.0)
     parser.add_argument("--minutes", type=float, default=1e6)
     parser.add_argument("--traffic", action="store_true")
+    parser.add_argument("--first-site", type=int, default=0)
     parser.add_argument("--worlds", action="store_true")
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--kept", action="store_true")
@@ -576,9 +578,10 @@ if __name__ == "__main__":
     elif given.year:
         name, text = "site-watch year", f"`python -m benchmarks.site_watch --year`; {GATEWAYS[8]} gateways.\n\n{year()}"
     elif given.traffic:
-        text = traffic(given.cases, time.monotonic() + 60.0 * given.minutes)
+        text = traffic(given.cases, time.monotonic() + 60.0 * given.minutes, given.first_site)
         name = "site-watch traffic"
-        text = f"`python -m benchmarks.site_watch --traffic --cases {given.cases}`; {GATEWAYS[8]} gateways.\n\n{text}"
+        asked = f"--cases {given.cases}" + (f" --first-site {given.first_site}" if given.first_site else "")
+        text = f"`python -m benchmarks.site_watch --traffic {asked}`; {GATEWAYS[8]} gateways.\n\n{text}"
     elif given.worlds:
         text = f"`python -m benchmarks.site_watch --worlds --cases {given.cases}`.\n\n{worlds(given.cases)}"
         name = "site-watch worlds"
