@@ -25,6 +25,7 @@ from calib.estimate.axes import LEAST_S, silent_directions
 from calib.estimate.correction import Law
 from calib.estimate.estimate import Estimate
 from calib.estimate.innovation import Innovation
+from calib.estimate.physics import WITHIN_U
 from calib.estimate.reference_share import ReferenceShare
 from calib.estimate.statements import Step
 from calib.model import PARAMETERS, Array, Calibration, Window, WindowSums, own_channels
@@ -36,6 +37,7 @@ DAY_S = 86400.0
 STATED = "stated by the configuration"  # the method of a calibration that it states with its date
 SAME_BUDGET = 1e-9  # of a variance: to which the squares of a budget add up
 NEAR = 0.1  # of its largest element, to which S is about another one
+TELLS_LAG = 0.3  # of what the clocks leave open of a window's lag: with less, its own slopes tell it
 SAME = 1e-6  # standard uncertainties: what rounding moves when the windows are taken again
 
 
@@ -176,6 +178,19 @@ class Estimation:
             if tried.innovation.statistic > self.gate.limit(tried.innovation.degrees_of_freedom):
                 return True
         return False
+
+    def own_lag_s(self, found: StretchWindows, day: float, lag_s: float, place: int, trial: State) -> float:
+        """The lag of windows that were made with `lag_s` taken out: that of a state `trial`, or their own.
+
+        The clocks leave `u_lag_s` of each window's own lag open. The slopes of the longest window tell it where their
+        noise leaves a small part of that open, and no lag that is further away than the clocks allow.
+        """
+        common_s = trial.lag_s(place)
+        window = max(found.used, key=lambda window: window.points)
+        left_s, u_s = self._tried_of(window, day, lag_s, found.temperature_degc, place).record.lag_left_s
+        if u_s > TELLS_LAG * window.u_lag_s or abs(lag_s + left_s - common_s) > WITHIN_U * window.u_lag_s:
+            return common_s
+        return lag_s + left_s
 
     def judge(
         self,

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agent.core.gate import Limit
+from calib.estimate.physics import WITHIN_U
 from calib.estimate.quantities import REFERENCE, REFERENCE_DRIFT, Quantity
 from calib.geometry import AXES, STANDARD_GRAVITY_MPS2
 from calib.model import Array, Calibration, own_channels
@@ -170,8 +171,13 @@ def _tried(
 def _differs_in_making(before: State, after: State, held: Sequence[Record], place: int) -> bool:
     """Whether the held windows were made with another filter or lag taken out than is right: they tell no exact S."""
     lag_s = after.lag_s(place)
-    phase_rad = max(abs(lag_s - record.lag_s) * float(np.sqrt(record.omega2)) for record in held)
-    return phase_rad > LARGEST_PHASE_RAD or after.has_another_response(before, place)
+    phases_rad = [_beyond_own_s(lag_s, record) * float(np.sqrt(record.omega2)) for record in held]
+    return max(phases_rad) > LARGEST_PHASE_RAD or after.has_another_response(before, place)
+
+
+def _beyond_own_s(lag_s: float, record: Record) -> float:
+    """By how much the lag that was taken out of a record differs from `lag_s` beyond what the clocks leave open."""
+    return max(abs(lag_s - record.lag_s) - WITHIN_U * record.u_lag_s, 0.0)
 
 
 def _of_either(

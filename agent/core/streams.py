@@ -333,11 +333,10 @@ class Streams:
 
         def lag_of(found: StretchWindows, lag_s: float) -> float:
             nonlocal trial
-            # What contradicts a known state must not move its lag: that would be an answer to another question.
-            if known and estimation.contradicted(found, day, lag_s, place):
-                return lag_s
-            trial = estimation.after(found.used, day, lag_s, found.temperature_degc, place)
-            return trial.lag_s(place)
+            # What contradicts a known state must not move the common lag: that would be an answer to another question.
+            if not (known and estimation.contradicted(found, day, lag_s, place)):
+                trial = estimation.after(found.used, day, lag_s, found.temperature_degc, place)
+            return estimation.own_lag_s(found, day, lag_s, place, trial)
 
         for _ in range(RESPONSE_TURNS):
             make = partial(self._make, piece, first_s, response, estimation.state.motion_to_hz)

@@ -239,7 +239,8 @@ def _stack(data: Condensed, held: Sequence[Pose], response: Array, excited: Arra
         direction=np.array([physics.padded(pose.direction, m) for pose in held]),
         gravity_mps2=np.array([pose.gravity_mps2 for pose in held]), along=along, along_rate_s=along_rate,
         excited=np.tile(np.eye(3) if excited is None else excited, (w, 1, 1)), root=data.root, slopes=data.slopes,
-        passed=passed, omega2=data.omega2, noise=data.type_a.noise, mean_x=data.mean_x, means=data.mean_v[:, None],
+        passed=passed, omega2=data.omega2, u_lag_s=np.zeros(w), noise=data.type_a.noise, mean_x=data.mean_x,
+        means=data.mean_v[:, None],
         over_t=np.tile(np.eye(1, 3), (w, 1, 1)), temperature_degc=np.full(w, np.nan), held_mps2=np.full((w, 3), np.nan),
         response=np.tile(np.pad(response, (0, TERMS - len(response))), (w, 1)),
     )  # fmt: skip

@@ -4,7 +4,7 @@ For output axis i, with the row S_i of S,
 
     a(t)            D u(t - lag) + R q u'(t) / omega + G,   G = R' G0 (1 + dg / |G0|)
     D               R (D0 + t L) (1 + T)^-1 / (1 + r)
-    slope on u      S_i D (1 - lag^2 omega^2 / 2)
+    slope on u      S_i D (1 - lag^2 omega^2 / 2), of a lag beyond what the clocks leave open of each window's own
     slope on du/dt  -S_i D lag + S_i R q / omega
     mean of V       S_i (D mean(u) + G) + Q_i + S_i (R q / omega - lag D) mean(du/dt), and Q's change with temperature
 
@@ -33,6 +33,7 @@ from calib.signal.response import by_term
 from calib.windows.record import TERMS, Record
 from calib.windows.type_a import Index
 
+WITHIN_U = 4.0  # of what the clocks leave open of a window's own lag: a lag further away is another common one
 STEP = 1e-30  # of the complex step: its square is lost beside 1, so that the derivative is exact
 AT_ONCE = 1000  # windows times inputs whose derivatives are found together: some 3 MB
 _PARTS = {
@@ -62,6 +63,7 @@ class Stack:
     slopes: Array
     passed: Array
     omega2: Array
+    u_lag_s: Array
     noise: Array
     mean_x: Array
     means: Array
@@ -169,9 +171,11 @@ class Windows:
         if not self.channels:
             return np.zeros((*p.shape[:-1], 0, 3))
         own, lag = self.stack, p[..., LAG]
+        # The front end took a window's own lag out: what the common one differs from it is not left in the window.
+        left_s = np.where(np.abs(lag.real) > WITHIN_U * own.u_lag_s[:, None], lag, 0.0)
         s = s @ own.excited + self.silent
         ideal = s @ (direction @ own.along)
-        on_u = ideal * (1.0 - 0.5 * lag**2 * own.omega2[:, None])[..., None]
+        on_u = ideal * (1.0 - 0.5 * left_s**2 * own.omega2[:, None])[..., None]
         on_rate = s @ (direction @ own.along_rate_s) - ideal * lag[..., None]
         on_rate = on_rate + _times(s, ahead)[..., None] * np.eye(1, self.channels)[0]
         slopes = own.root @ np.concatenate([on_u - left[..., None, None] * ideal, on_rate], axis=-1).mT

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.model import Array, BandSums, Pose, Window, WindowSums
+from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
 from calib.signal.response import ALL_POWERS
 from calib.windows.bands import ABOVE, HIGHEST, centre_hz, motion_band_hz, parts, share_above
 from calib.windows.condense import Condensed, condense, mean_frequency_hz, regressed
@@ -208,6 +208,17 @@ class Record:
         size = np.zeros_like(self.slopes)
         size[:m] = self.slopes[:m]
         return np.array([(-self.root[:, m:] @ b[:m] / self.noise).ravel(), (size / self.noise).ravel()])
+
+    @property
+    def lag_left_s(self) -> tuple[float, float]:
+        """The lag that is left in the window by its own slopes, and its standard uncertainty by its noise, in s; (0,
+        inf) where nothing moves."""
+        m, own = self.channels, own_channels(self.channels)
+        b = regressed(self.root, self.slopes)
+        by_lag = (self.root[:, m : m + own] @ b[:own] / self.noise).ravel()
+        told = (self.root[:, m : m + own] @ b[m : m + own] / self.noise).ravel()
+        information = float(by_lag @ by_lag)
+        return (-float(by_lag @ told) / information, information**-0.5) if information > 0.0 else (0.0, np.inf)
 
     def slopes_at_lag(self, lag_s: float) -> Array:
         """(2M, 3) the slopes as if `lag_s` had been taken out: of first order, for microseconds."""

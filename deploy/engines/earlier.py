@@ -86,6 +86,8 @@ REVISIONS = (
     # The last before a fast reference is not folded, and slow motion excites by its whole power.
     Revision(23, "5c157bb27d11", "0.3.0"),
     Revision(24, "b1bf78ccaf86", "0.3.0"),
+    # The last before the lag that a window has by itself is taken out of its samples.
+    Revision(25, "eae836b18aa3", "0.3.0"),
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -148,3 +149,26 @@ def test_a_turn_is_perturbed_from_the_left(where: slice) -> None:
             np.testing.assert_allclose(own_d[0, :, axis], expected, rtol=0, atol=1e-4 * (np.abs(expected).max() + 1e-9))
     assert slope.shape[1] == 18
     assert mean.shape[1] == 3
+
+
+LATE_S = 0.006  # 0.11 rad of the tones' mean frequency: of second order, 0.6 %
+
+
+def test_the_slopes_of_a_window_tell_its_own_lag() -> None:
+    late = record(lambda t, _: (motion(t - LATE_S)[0] @ D.T + GRAVITY) @ S_TRUE.T + Q_TRUE)
+    left_s, u_s = late.lag_left_s
+    assert left_s == pytest.approx(LATE_S, rel=0.01)  # of first order: the front end takes it out and looks again
+    assert 0.0 < u_s < 1e-6
+    resting = record(lambda t, _: np.tile(GRAVITY @ S_TRUE.T, (len(t), 1)), lambda t: (np.zeros((len(t), 3)),) * 2)
+    assert resting.lag_left_s == (0.0, np.inf)
+
+
+@pytest.mark.parametrize("u_lag_s", [0.0, 0.5 * LATE_S])
+def test_an_own_lag_that_was_taken_out_makes_no_slope_smaller(u_lag_s: float) -> None:
+    """The common lag differs by LATE_S from what was taken out. Where the clocks leave as much open of a window's own
+    lag, its samples are in time; else the lag is left in them, and makes the slopes smaller."""
+    in_time = record(lambda _, u: (u @ D.T + GRAVITY) @ S_TRUE.T + Q_TRUE)
+    windows = Windows(Stack.of([replace(in_time, u_lag_s=u_lag_s)], fixed=False), at_hz=0.0, share=0.5, known_size=0.0)
+    before, same, after = (windows.predicted(inputs(LAG=lag_s)[None])[0] for lag_s in (-LATE_S, 0.0, LATE_S))
+    smaller = 0.0 if u_lag_s else LATE_S**2 * in_time.omega2
+    np.testing.assert_allclose(before + after, (2.0 - smaller) * same, rtol=0.0, atol=1e-9 * np.abs(same).max())
