@@ -92,7 +92,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Of a test marked `one_case`, all cases but the first are thorough; of one marked `two_cases`, all but the first
     two are nightly.
 
-    Files with many slow tests come first: as one of the last they would keep one process busy while others have ended.
+    Worlds of days and years and files with many slow tests come first: as one of the last they would keep one process
+    busy while others have ended.
     """
     seen = Counter[str]()
     for item in items:
@@ -106,7 +107,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.get_closest_marker("nightly"):
             item.add_marker("thorough")
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
-    items.sort(key=lambda item: -slow[item.path])
+    items.sort(key=lambda item: (not item.nodeid.startswith(COMPUTED), -slow[item.path]))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import select
 import tempfile
@@ -105,6 +106,10 @@ class PtyDevice:
                 commands = os.read(self._master, 4096)
             except BlockingIOError:
                 return
+            except OSError as error:
+                if error.errno != errno.EIO:
+                    raise
+                return  # the reader has closed the port since it was looked whether there is one
         self._received(commands)
 
     def start(self) -> None:

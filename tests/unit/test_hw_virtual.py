@@ -271,6 +271,25 @@ def test_unplugged_the_path_is_gone_and_the_reader_hung_up(silent_port: PtyDevic
     os.close(file)
 
 
+def test_a_reader_that_closes_the_port_between_two_looks_does_not_end_the_device(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A regression test. The thread of the device ended, and no later reader got an answer."""
+    heard: list[bytes] = []
+    port = PtyDevice(lambda _: b"", link=tmp_path / "port", received=heard.append)
+    reader = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
+    os.close(reader)
+    monkeypatch.setattr(port, "_open_for_reading", lambda: True)
+    port.serve()
+    monkeypatch.undo()
+    reader = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
+    os.write(reader, b"who?")
+    port.serve()
+    os.close(reader)
+    port.stop()
+    assert heard == [b"who?"]
+
+
 def test_a_path_that_is_taken_is_refused(tmp_path: Path) -> None:
     taken = tmp_path / "port"
     taken.touch()
