@@ -47,7 +47,8 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _BETWEEN_BLANKS = re.compile(r'"([^"]*)"|(\S+)')
 _NUMERIC = re.compile(r"[+-]?[\d.,]+(?:[eE][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?")
-_VALUE = r"[^\d\n]{0,30}?(?P<value>\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)[;,\t ]*(?:[A-Za-z\xb5/]+)?"
+# No digits of a name, such as those of the module MX840 in the next column.
+_VALUE = r"[^\d\n]{0,30}?(?<![^\W\d])(?P<value>\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?)[;,\t ]*(?:[A-Za-z\xb5/]+)?"
 _RATE = re.compile(
     r"(?:(?:sampl\w{0,8}|scan|update|data|output|measurement|acquisition|logging|recording)[\s_]{0,4}(?:rate|freq\w*)"
     rf"|\b(?:rate|freq|frequency|fs|odr|at)\b){_VALUE}",

@@ -52,6 +52,7 @@ FORMATS = (
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 BAGS = FORMATS[:3]
+ONE_CHANNEL = "its lines hold one channel: write time, x, y and z as columns of a CSV"
 # What is not read: how such a file begins, what it is, and what to do with it.
 NOT_READ = (
     (rb'"?TOB[123]"?[,\s]', "TOB, the binary format of Campbell Scientific", "convert it to TOA5 (CardConvert)"),
@@ -59,6 +60,12 @@ NOT_READ = (
     (rb"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "a file of Office before 2007", "write it as .xlsx or CSV"),
     (rb"\xff\xfe\x00\x00|\x00\x00\xfe\xff", "text in UTF-32", "write it in UTF-8"),
     (rb'(?:\xef\xbb\xbf)?\s*(?:\{\s*["}]|\[\s*[\[{])', "JSON", "write it as CSV"),
+    (rb" {0,4}-1 *\r?\n +\d+", "UFF58, the universal file format", "write it as CSV"),
+    (rb"TIMESERIES \S+,", "the text of a seismic archive (SLIST or TSPAIR)", "take it as MiniSEED"),
+    (rb"Origin Time +\d", "a record of K-NET or KiK-net", ONE_CHANNEL),
+    (rb"PEER ", "a record of PEER (AT2)", ONE_CHANNEL),
+    (rb"(?:Uncorrected|Corrected) [^\n]{0,40}\(Format v", "a record in the format of COSMOS", ONE_CHANNEL),
+    (rb"EVENT_NAME: ", "a record of ESM or ITACA (DYNA)", ONE_CHANNEL),
     (rb"(?:\xef\xbb\xbf)?\s*<(?:\?xml|!DOCTYPE|html)", "XML or HTML", "write it as CSV"),
 )
 TEXT = Format("CSV", (".csv", ".tsv", ".txt", ".dat"), (), "agent.reading.delimited:Delimited")

@@ -12,6 +12,7 @@ import pytest
 
 from agent.calibrate.tables import read_reference, read_sensor
 from agent.cli.main import run_cli
+from agent.reading.dialect import dialect_of
 from agent.reading.source import TableError
 from calib.geometry import STANDARD_GRAVITY_MPS2 as G
 
@@ -145,6 +146,13 @@ def test_columns_whose_names_tell_an_order(names: str, read: str, tmp_path: Path
         (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "write it as .xlsx"),
         ("time_s,vx,vy,vz\n".encode("utf-32"), "write it in UTF-8"),
         (b'{"t": 0, "x": 1}\n', "it is JSON"), (b'[{"t": 0}]', "it is JSON"), (b"<?xml version='1.0'?>", "it is XML"),
+        (b"    -1\r\n    58\r\nacc X\r\n", "it is UFF58"),
+        (b"TIMESERIES XX_STA_00_HNZ_R, 4 samples, 100 sps, 2024-03-25T14:22:13, SLIST, INTEGER, Counts\n"
+         b"9813\t10123\t10401\t10624\n", "take it as MiniSEED"),
+        (b"Origin Time       2011/03/11 14:46:00\nLat.              38.103\n", "K-NET .* one channel"),
+        (b"PEER NGA STRONG MOTION DATABASE RECORD\n", "PEER .* one channel"),
+        (b"Uncorrected acceleration  (Format v01.20 with 13 text lines)\n", "COSMOS.* one channel"),
+        (b"EVENT_NAME: X\nEVENT_ID: EMSC-1\n", "ESM .* one channel"),
     ],
 )  # fmt: skip
 def test_files_that_are_not_read(begin: bytes, told: str, tmp_path: Path) -> None:
@@ -152,6 +160,15 @@ def test_files_that_are_not_read(begin: bytes, told: str, tmp_path: Path) -> Non
     path.write_bytes(begin)
     with pytest.raises(TableError, match=told):
         read_sensor(path)
+
+
+@pytest.mark.parametrize("name", ["MX840_CH_1", "QuantumX_1615", "cDAQ9188"])
+def test_a_number_in_the_name_of_a_device_is_no_rate(name: str, tmp_path: Path) -> None:
+    """A regression test. Behind "default sample rate", 840 of a module MX840 was the rate in Hz."""
+    path = tmp_path / "s.txt"
+    head = f"Time 1 - default sample rate\t{name}"
+    path.write_text(f"CATMAN\n{head}\tb\tc\ns\tg\tg\tg\n" + "".join(f"{k / 50:.2f}\t0\t0\t1\n" for k in range(100)))
+    assert dialect_of(path).rate_hz is None
 
 
 def test_empty_quoted_fields_between_blanks(tmp_path: Path) -> None:
