@@ -61,7 +61,7 @@ NOT_READ = (
     (rb"\xff\xfe\x00\x00|\x00\x00\xfe\xff", "text in UTF-32", "write it in UTF-8"),
     (rb'(?:\xef\xbb\xbf)?\s*(?:\{\s*["}]|\[\s*[\[{])', "JSON", "write it as CSV"),
     (rb" {0,4}-1 *\r?\n +\d+", "UFF58, the universal file format", "write it as CSV"),
-    (rb"TIMESERIES \S+,", "the text of a seismic archive (SLIST or TSPAIR)", "take it as MiniSEED"),
+    (rb"TIMESERIES \S+,", "the text of a seismic archive (SLIST or TSPAIR)", "fetch the same data as MiniSEED"),
     (rb"Origin Time +\d", "a record of K-NET or KiK-net", ONE_CHANNEL),
     (rb"PEER ", "a record of PEER (AT2)", ONE_CHANNEL),
     (rb"(?:Uncorrected|Corrected) [^\n]{0,40}\(Format v", "a record in the format of COSMOS", ONE_CHANNEL),

@@ -223,7 +223,8 @@ class Equations:
 
 
 def _stack(data: Condensed, held: Sequence[Pose], response: Array, excited: Array | None) -> physics.Stack:
-    """What the physics needs of condensed windows in these poses; `response` (K,) was taken out of all of them."""
+    """What the physics needs of condensed windows in these poses; `response` (K,) and one lag
+    were taken out of all of them: none has its own lag taken out."""
     w, m = len(held), data.channels
     along, along_rate = np.tile(np.eye(m), (w, 1, 1)), np.zeros((w, m, m))
     for k, pose in enumerate(held):

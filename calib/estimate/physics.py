@@ -4,7 +4,7 @@ For output axis i, with the row S_i of S,
 
     a(t)            D u(t - lag) + R q u'(t) / omega + G,   G = R' G0 (1 + dg / |G0|)
     D               R (D0 + t L) (1 + T)^-1 / (1 + r)
-    slope on u      S_i D (1 - lag^2 omega^2 / 2), of a lag beyond what the clocks leave open of each window's own
+    slope on u      S_i D (1 - lag^2 omega^2 / 2); S_i D within the own lag that the clocks leave open of a window
     slope on du/dt  -S_i D lag + S_i R q / omega
     mean of V       S_i (D mean(u) + G) + Q_i + S_i (R q / omega - lag D) mean(du/dt), and Q's change with temperature
 

@@ -15,7 +15,8 @@ from calib.signal.order_statistics import median
 
 TURNS = 4  # each iteration leaves about a thousandth of the lag
 BASIN_RAD = 0.5  # of the motion's mean phase: from a start that is so near, the iterations lead to the lag
-# Limit of (omega lag)^3 / 6, the error of the window equations, which are of second order in the remaining lag.
+# Limit of (omega lag)^3 / 6, the error of window equations of second order in the remaining lag. Of those of first
+# order (calib.estimate.physics, within what the clocks leave open) the error is then 8e-6.
 PHASE_LEFT = 1e-8
 SLOWEST = 0.25  # of the mean frequency of the motion: slower motion does not count in a correlation
 AS_HIGH = 0.9  # of the highest peak of a correlation: peaks of motion with one frequency differ by less

@@ -148,7 +148,7 @@ def test_columns_whose_names_tell_an_order(names: str, read: str, tmp_path: Path
         (b'{"t": 0, "x": 1}\n', "it is JSON"), (b'[{"t": 0}]', "it is JSON"), (b"<?xml version='1.0'?>", "it is XML"),
         (b"    -1\r\n    58\r\nacc X\r\n", "it is UFF58"),
         (b"TIMESERIES XX_STA_00_HNZ_R, 4 samples, 100 sps, 2024-03-25T14:22:13, SLIST, INTEGER, Counts\n"
-         b"9813\t10123\t10401\t10624\n", "take it as MiniSEED"),
+         b"9813\t10123\t10401\t10624\n", "fetch the same data as MiniSEED"),
         (b"Origin Time       2011/03/11 14:46:00\nLat.              38.103\n", "K-NET .* one channel"),
         (b"PEER NGA STRONG MOTION DATABASE RECORD\n", "PEER .* one channel"),
         (b"Uncorrected acceleration  (Format v01.20 with 13 text lines)\n", "COSMOS.* one channel"),
