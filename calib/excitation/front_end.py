@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.excitation import detection
 from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
+from calib.excitation.clock_bend import bent
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
 from calib.excitation.hum import hum_hz, without_lines
 from calib.excitation.knocks import knocks
@@ -333,9 +334,13 @@ def _motion(
     settings: Settings,
     response: Response,
 ) -> list[Window]:
-    align = partial(aligned, sensor, reference, instrument, span_s, lag_s, settings, response)
-    if (found := align()) is None:
+    beside = reference, instrument, span_s, lag_s, settings, response
+    if (found := aligned(sensor, *beside)) is None:
         return []
+    if settings.limit_band and (better := bent(sensor, reference, found.points)) is not None:
+        sensor = better
+        found = aligned(sensor, *beside) or found
+    align = partial(aligned, sensor, *beside)
     stands, pose = pose, with_integral(pose) if instrument.has_corner else pose
     made = _beside(pose, found, settings)
     if settings.limit_band and settings.to_hz is None and (lasting_hz := _beside_shocks(found.points, made)):
