@@ -32,7 +32,7 @@ def bent(sensor: Samples, reference: Samples, points: Points) -> Samples | None:
     `points` are those of both at the same times, with the mean lag taken out but for a part. The mean lag stays.
     """
     of_both = sensor.clock, reference.clock
-    u_end_s = float(np.hypot(*(clock.u_offset_s for clock in of_both)))
+    u_end_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     n, m = len(points.time_s), own_channels(points.u.shape[1])
     if any(len(clock.knot_index) != 2 for clock in of_both) or n < SEGMENTS * FEWEST_POINTS:
         return None  # the clock of a long file is not one parabola

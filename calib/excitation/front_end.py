@@ -337,8 +337,8 @@ def _motion(
     beside = reference, instrument, span_s, lag_s, settings, response
     if (found := aligned(sensor, *beside)) is None:
         return []
-    if settings.limit_band and (better := bent(sensor, reference, found.points)) is not None:
-        sensor = better
+    if settings.limit_band and (in_step := bent(sensor, reference, found.points)) is not None:
+        sensor = in_step
         found = aligned(sensor, *beside) or found
     align = partial(aligned, sensor, *beside)
     stands, pose = pose, with_integral(pose) if instrument.has_corner else pose

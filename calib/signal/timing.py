@@ -120,8 +120,8 @@ class ClockFit:
         )
 
     def bent(self, bend_s: Array, span_s: tuple[float, float]) -> ClockFit:
-        """The same clock with the first and the second Legendre polynomial over `span_s`, times `bend_s` (2,) in s, added
-        to its times. Their mean over the span is 0."""
+        """The same clock with the first and the second Legendre polynomial over `span_s`, times `bend_s` (2,) in s,
+        added to its times. Their mean over the span is 0."""
         middle_s, half_s = 0.5 * (span_s[0] + span_s[1]), 0.5 * (span_s[1] - span_s[0])
         x = (self.knot_time_s - middle_s) / half_s
         return replace(
