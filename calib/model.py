@@ -111,6 +111,8 @@ class Window:
     name. `u_lag_s` is the standard uncertainty of this window's own lag, as far as the two clocks show it.
     `independent` is the share of statistically independent points: below 1 after both signals were limited to a band.
     `motion_hz`: the band of the motion that lasts, before anything was limited; None where `bands` tell it.
+    `lag_bend` (2, 2 m, 3): what the slopes of V on u and du/dt are more, for one standard uncertainty of each of two
+    independent parts of what is open of the lag within the window; None where that is nothing.
     """
 
     start_s: float
@@ -130,6 +132,7 @@ class Window:
     bands: BandSums | None = None  # None at rest, and where no response over frequency is estimated
     response: tuple[float, ...] = ()  # terms (calib.signal.response) that were taken out; () where none were
     motion_hz: tuple[float, float] | None = None
+    lag_bend: Array | None = None
 
     @property
     def silent_noise(self) -> Array:

@@ -234,6 +234,7 @@ class _Slopes:
         attribute   source in the budget                  covariance
         _white      type A                                w I: variance over that of white noise, by near windows
         _loaded 0   lag between windows                   l l' u(lag)^2 / n: l = derivatives by a lag
+        _bent       lag between windows                   b b' / n: b = what is open of the lag within a window
         _loaded 1   correction for the reference's noise  s s' a^2 / n: s = the slopes; a = u of the correction
         _missed     directions without motion             diag(d^2 u(S)^2): d = what moved a little along them
         _spread     temperature                           c c' (range of temperature)^2, of a window that tells none
@@ -256,6 +257,7 @@ class _Slopes:
         u_lag_s = [max(p.lag_window_s, r.u_lag_s) * (p.lag_s > 0.0) for p, r in zip(priors, records, strict=True)]
         u = np.array([u_lag_s, [r.attenuation for r in records]]).T / np.sqrt(merged)[:, None]
         self._loaded = np.array([r.loadings for r in records]).mT * u[:, None]
+        self._bent = np.array([r.by_bend for r in records]).mT / np.sqrt(merged)[:, None, None]
         self._white = _white([own.slopes for own in noise], records)
         # What nobody knows of S along directions that were not excited, by the little that moved there.
         unknown = np.minimum(s.u[:9], FLAT * s.scale).reshape(3, 3)
@@ -276,7 +278,7 @@ class _Slopes:
         """(W, 6M, 6M) that of the root of the covariance, in units of the noise of a point."""
         one = np.eye(self._missed.shape[1])
         covariance = self._white[:, None, None] * one + self._missed[..., None] ** 2 * one
-        for scatter in (self._loaded, self._spread, self._beside):
+        for scatter in (self._loaded, self._bent, self._spread, self._beside):
             covariance = covariance + scatter @ scatter.mT
         if self._stretch.any():
             for i in range(3):
@@ -288,10 +290,10 @@ class _Slopes:
     def shares(self, gains: Array) -> dict[str, Array]:
         """By source, of the variances of m quantities that move by `gains` (W, 6M, m) with the weighted slopes."""
         moved = (self.weights.mT @ gains) * self._noise[..., None]
-        by_load = (self._loaded.mT @ moved) ** 2
+        by_load, by_bend = (self._loaded.mT @ moved) ** 2, ((self._bent.mT @ moved) ** 2).sum(axis=(0, 1))
         by_walk = sum(((self._walked[:, :, i].mT @ moved[:, i::3]) ** 2).sum(axis=1) for i in range(3))
         shares = {
-            TYPE_A: np.einsum("w,wrm->m", self._white, moved**2), LAGS: by_load[:, 0].sum(axis=0),
+            TYPE_A: np.einsum("w,wrm->m", self._white, moved**2), LAGS: by_load[:, 0].sum(axis=0) + by_bend,
             CORRECTION: by_load[:, 1].sum(axis=0), UNSEEN: ((self._missed[..., None] * moved) ** 2).sum(axis=(0, 1)),
             WALK: self._stretch @ by_walk, REFERENCE_DRIFT.source: ((self._drifted.mT @ moved) ** 2).sum(axis=(0, 1)),
         }  # fmt: skip

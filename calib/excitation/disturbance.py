@@ -41,12 +41,14 @@ TINY = 1e-300
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFilter:
-    """Taps (2 k + 1,) of the filter, its amplitude (F,) at frequencies (F,) from 0 to half the sampling rate, the rms
-    (2, m) of the reference's noise in u and du/dt before it, and the part (2, m) of both that it leaves."""
+    """Taps (2 k + 1,) of the filter; at frequencies (F,) from 0 to half the sampling rate its amplitude (F,), and the
+    power of a line of the motion and of the noise before it (2, F); the rms (2, m) of the reference's noise in u and
+    du/dt before it, and the part (2, m) of both that it leaves."""
 
     taps: Array
     frequency_hz: Array
     amplitude: Array
+    spectra: Array
     reference_noise: Array
     noise_left: Array
 
@@ -56,9 +58,13 @@ class NoiseFilter:
         return np.asarray(convolved(columns - mean, self.taps) + mean)
 
     def independent(self, to_hz: float) -> float:
-        """The share of the points that stay independent after this filter and one that ends at `to_hz`."""
-        power = self.amplitude[self.frequency_hz <= to_hz] ** 2
-        return float(np.sum(power) ** 2 / (len(self.amplitude) * np.sum(power**2)))
+        """The share of the points that count as independent after this filter and one that ends at `to_hz`.
+
+        The noise at the frequencies of the motion makes the slopes uncertain, and the filter passes these best: with
+        spectra of motion and noise as they are after it, the variance of a slope is sum(motion noise) / sum(motion)^2.
+        """
+        motion, noise = self.amplitude**2 * self.spectra * (self.frequency_hz <= to_hz)
+        return float(motion.sum() * noise.sum() / (len(self.amplitude) * max(float(motion @ noise), TINY)))
 
     def before(self, reference_noise: Array) -> Array:
         """The reference's noise (2, m) before the filter, from that after it."""
@@ -105,7 +111,8 @@ def against_noise(points: Points, reference_noise: Array, *, knocked: bool, deri
     weights = np.clip(np.sqrt(np.minimum(usual / noise, 1.0) * motion / (motion + noise)), LEAST_WEIGHT, 1.0)
     weights[: int(np.flatnonzero(moved)[0])] = 1.0  # slow changes of the mean are judged, not hidden
     lowest_hz = float(edges[np.flatnonzero(moved)[0]]) * rate_hz / size
-    return _filter(weights, edges, size, rate_hz, lowest_hz, len(u), reference_noise, derivatives)
+    spectra = np.stack([motion, noise])
+    return _filter(weights, edges, size, rate_hz, lowest_hz, len(u), spectra, reference_noise, derivatives)
 
 
 def not_more_than_incoherent(noise: Array, u: Array, V: Array, rate_hz: float, derivatives: int) -> Array:
@@ -175,16 +182,20 @@ def _parted(power: Complex, other: Complex, both: Complex, count: NDArray[np.int
 
 
 def _filter(
-    weights: Array, edges: NDArray[np.int64], size: int, rate_hz: float, lowest_hz: float, samples: int, noise: Array,
-    derivatives: int,
+    weights: Array, edges: NDArray[np.int64], size: int, rate_hz: float, lowest_hz: float, samples: int, spectra: Array,
+    noise: Array, derivatives: int,
 ) -> NoiseFilter:  # fmt: skip
-    """A filter with these weights in the bands, of linear phase around its middle tap; `noise` (2, m) before it."""
+    """A filter with these weights in the bands, of linear phase around its middle tap; `spectra` (2, B) of motion and
+    noise and `noise` (2, m) before it."""
     frequency_hz = np.arange(size // 2 + 1) * rate_hz / size
-    amplitude = np.concatenate([np.full(int(edges[0]), weights[0]), np.repeat(weights, np.diff(edges)), weights[-1:]])
+    rows = np.vstack([spectra, weights])
+    lines = np.hstack([np.repeat(rows[:, :1], edges[0], axis=1), np.repeat(rows, np.diff(edges), axis=1), rows[:, -1:]])
+    spectra, amplitude = lines[:2], lines[2]
     half = int(min(CYCLES * rate_hz / lowest_hz, MOST_LOST * samples, size // 2 - 1))
     taps = np.roll(np.fft.irfft(amplitude, size), half)[: 2 * half + 1] * hanning(2 * half + 3)[1:-1]
     passed = np.abs(np.fft.rfft(np.roll(np.pad(taps, (0, size - len(taps))), -half)))
-    return NoiseFilter(taps, frequency_hz, passed, noise, _left_of(noise, frequency_hz, passed, derivatives))
+    left = _left_of(noise, frequency_hz, passed, derivatives)
+    return NoiseFilter(taps, frequency_hz, passed, spectra, noise, left)
 
 
 def _left_of(noise: Array, frequency_hz: Array, amplitude: Array, derivatives: int) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.excitation import detection
 from calib.excitation.band_to_keep import FILTER_BAND, LEAST_MOTION_MPS2, band_to_keep
-from calib.excitation.clock_bend import bent
+from calib.excitation.clock_bend import ClockBend, clock_bend
 from calib.excitation.disturbance import NoiseFilter, against_noise, not_more_than_incoherent
 from calib.excitation.hum import hum_hz, without_lines
 from calib.excitation.knocks import knocks
@@ -337,10 +337,11 @@ def _motion(
     beside = reference, instrument, span_s, lag_s, settings, response
     if (found := aligned(sensor, *beside)) is None:
         return []
-    if settings.limit_band and (in_step := bent(sensor, reference, found.points)) is not None:
-        sensor = in_step
-        found = aligned(sensor, *beside) or found
-    align = partial(aligned, sensor, *beside)
+    bend = clock_bend(sensor, reference, found.points, found.independent) if settings.limit_band else None
+    in_step = sensor if bend is None else bend.taken_out(sensor)
+    if bend is not None:
+        found = aligned(in_step, *beside) or found
+    align = partial(aligned, in_step, *beside)
     stands, pose = pose, with_integral(pose) if instrument.has_corner else pose
     made = _beside(pose, found, settings)
     if settings.limit_band and settings.to_hz is None and (lasting_hz := _beside_shocks(found.points, made)):
@@ -356,9 +357,18 @@ def _motion(
     u_lag_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     taken = () if response.is_flat else response.terms
     made = [replace(_slow(_with_numbers(w, found), found.points), u_lag_s=u_lag_s, response=taken) for w in made]
+    if bend is not None:
+        made = [_with_bend(w, found.points, bend) for w in made]
     # Where the noise of the reference is stated, all other noise is the sensor's.
     sensor_noise = np.full(3, np.inf) if instrument.noise > 0.0 else found.sensor_noise
     return [_with_noise(w, sensor_noise, instrument.derivatives, against) for w in made]
+
+
+def _with_bend(window: Window, points: Points, bend: ClockBend) -> Window:
+    """The window with what is left open of the lag within it."""
+    if not window.used or window.kind != "motion":
+        return window
+    return replace(window, lag_bend=bend.left_in(points.within(window.start_s, window.stop_s)))
 
 
 def _with_noise(window: Window, sensor_noise: Array, derivatives: int, against: NoiseFilter | None) -> Window:

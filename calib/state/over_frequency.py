@@ -94,7 +94,7 @@ class OverFrequency:
         the middle of the band, or that around which the motion of a window is, `centre_hz`, where that is lower. Motion
         that comes and goes, such as that of a lorry, reaches higher than what several windows have in common."""
         if self.motion_hz is None:
-            return self.first_hz
+            return min(centre_hz, self.first_hz)
         low_hz, high_hz = self.motion_hz
         if self.late_s is not None and low_hz <= self.first_hz <= self.to_hz:
             return self.first_hz

@@ -106,8 +106,23 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
         deviations=reduce(Deviations.plus, each("deviations"), Deviations()),
         left_open=reduce(LeftOpen.plus, each("left_open"), LeftOpen()), mean_hz=by_windows("mean_hz"),
         motion=reduce(MotionSums.plus, motions) if motions else None,
-        to_hz=max(each("to_hz")), bands=None, reference_noise=None,
+        to_hz=max(each("to_hz")), bands=None, reference_noise=None, lag_bend=_bends(records, root, noise),
     )  # fmt: skip
+
+
+def _bends(records: Sequence[Record], root: Array, noise: Array) -> Array | None:
+    """(2, 2M, 3) what is open of the lag within the windows, as that of one record with this root and noise: times the
+    root of the number of windows, as if all were alike. Of all that they leave open, the two largest parts stay.
+    """
+    if all(r.lag_bend is None for r in records):
+        return None
+    told = [r for r in records if r.lag_bend is not None]
+    back = np.linalg.pinv(root.T, rcond=1e-9)
+    moved = [back @ (r.root.T @ (r.root @ r.lag_bend)) / np.sqrt(r.windows) for r in told]
+    parts = np.concatenate(moved) / noise
+    _, size, ways = np.linalg.svd(parts.reshape(len(parts), -1), full_matrices=False)
+    largest = np.sqrt(sum(r.windows for r in records)) * size[:2, None] * ways[:2]
+    return np.asarray(np.linalg.pinv(root, rcond=1e-9) @ (largest.reshape(2, -1, 3) * noise))
 
 
 def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, Array, Array]:

@@ -22,6 +22,8 @@ from calib.windows.excited import MotionSums, excited, excited_together, excited
 from calib.windows.never_turned import mean_input
 
 TERMS = len(ALL_POWERS)  # of the response over frequency, at most
+# The mean frequency by power, over that by the logarithm, from which on a motion has frequencies far apart.
+FAR_APART = 2.0
 WIDER = 1.1  # later windows may move so much faster than the first one whose motion is in a band
 TOLD = 6  # rows of the terms of the response that are kept: five terms and a residual
 
@@ -94,6 +96,7 @@ class Record:
     behind_k: float = 0.0
     bands: BandSums | None = None
     reference_noise: Array | None = None
+    lag_bend: Array | None = None
 
     @classmethod
     def of(
@@ -135,6 +138,7 @@ class Record:
             mean_input(window), float(data.count[0]), told, deviations, left_open,
             lasts_hz, mean_hz,
             to_hz=ends_hz, bands=kept, reference_noise=noise, motion=motion_of(window) if turned else None,
+            lag_bend=window.lag_bend,
         )  # fmt: skip
         return made.within(to_hz) or made
 
@@ -155,6 +159,7 @@ class Record:
         window = Window(
             0.0, 0.0, self.pose, sums, True, "", round(count), 0, u_lag_s=self.u_lag_s, independent=bands.independent,
             reference_noise=self._noise_within(bands), bands=bands, response=self.response, motion_hz=self.motion_hz,
+            lag_bend=self.lag_bend,
         )  # fmt: skip
         made = Record.of(window, self.day, self.lag_s, self.temperature_degc, self.reference, to_hz)
         return replace(made, mean_x=self.mean_x, to_hz=to_hz, scores=self.scores, behind_k=self.behind_k)
@@ -174,10 +179,14 @@ class Record:
 
     @property
     def centre_hz(self) -> float:
-        """The frequency around which most of its motion is; 0 where nothing moves."""
-        if self.bands is None or self.motion_hz is None:
+        """The frequency around which most of its motion is; 0 where nothing moves. Of a few tones that lie far apart,
+        as of waves and an engine, the mean frequency by power is one at which nothing moves."""
+        if self.bands is None:
             return self.mean_hz
-        return centre_hz(self.bands, self.motion_hz)
+        if self.motion_hz is not None:
+            return centre_hz(self.bands, self.motion_hz)
+        found_hz = centre_hz(self.bands, (0.0, np.inf))
+        return found_hz if FAR_APART * found_hz < self.mean_hz else self.mean_hz
 
     @property
     def planar(self) -> bool:
@@ -208,6 +217,14 @@ class Record:
         size = np.zeros_like(self.slopes)
         size[:m] = self.slopes[:m]
         return np.array([(-self.root[:, m:] @ b[:m] / self.noise).ravel(), (size / self.noise).ravel()])
+
+    @property
+    def by_bend(self) -> Array:
+        """(2, 6M) what the slopes, whitened by the noise, are more for one standard uncertainty of each of two
+        independent parts of what is open of the lag within the window."""
+        if self.lag_bend is None:
+            return np.zeros((2, 6 * self.channels))
+        return np.asarray((self.root @ self.lag_bend / self.noise).reshape(2, -1))
 
     @property
     def lag_left_s(self) -> tuple[float, float]:

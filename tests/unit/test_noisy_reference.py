@@ -93,7 +93,12 @@ def test_a_filter_tells_how_many_points_and_how_much_noise_stay_in_a_band() -> N
     quarter of the noise."""
     frequency_hz = np.linspace(0.0, 50.0, 5001)
     passes = NoiseFilter(
-        np.ones(1), frequency_hz, np.where(frequency_hz < 20.0, 1.0, 1e-3), np.zeros((2, 3)), np.ones((2, 3))
+        np.ones(1),
+        frequency_hz,
+        np.where(frequency_hz < 20.0, 1.0, 1e-3),
+        np.ones((2, 5001)),
+        np.zeros((2, 3)),
+        np.ones((2, 3)),
     )
     products, noises = np.tile(np.eye(9), (3, 1, 1)), np.ones((3, 9))
     low_hz, high_hz, points = (
