@@ -116,9 +116,9 @@ def _bends(records: Sequence[Record], root: Array, noise: Array) -> Array | None
     """
     if all(r.lag_bend is None for r in records):
         return None
-    told = [r for r in records if r.lag_bend is not None]
+    told = [(r.root, r.lag_bend / np.sqrt(r.windows)) for r in records if r.lag_bend is not None]
     back = np.linalg.pinv(root.T, rcond=1e-9)
-    moved = [back @ (r.root.T @ (r.root @ r.lag_bend)) / np.sqrt(r.windows) for r in told]
+    moved = [back @ (own.T @ (own @ bend)) for own, bend in told]
     parts = np.concatenate(moved) / noise
     _, size, ways = np.linalg.svd(parts.reshape(len(parts), -1), full_matrices=False)
     largest = np.sqrt(sum(r.windows for r in records)) * size[:2, None] * ways[:2]
