@@ -7,6 +7,8 @@ import pytest
 
 from calib.estimate.nuisances import Priors
 from calib.excitation.detection import incoherent, knocked, least_step
+from calib.excitation.disturbance import against_noise
+from calib.excitation.windows import Points
 from calib.recorded.adjusting import adjusted
 from calib.recorded.outcome import Outcome
 from tests.pair import Disturbance, Pair, flat, hum, noise, pair, rattle, resonance, undisturbed
@@ -103,3 +105,32 @@ def test_a_residual_that_grows_with_the_motion_is_no_knock() -> None:
     struck, _ = knocked(V, np.column_stack([np.ones(6000), u]), least_step(V))
     assert struck[hit].all()
     assert struck.sum() < 20 + 0.01 * 6000
+
+
+def test_noise_at_the_frequencies_of_the_motion_counts_most() -> None:
+    """Slopes of a structure with one mode, beside a band of rattle that the filter takes away: 60 draws of 9 slopes
+    scatter by at most what their independent points say, and by no less than 0.6 of it, as variance (standard error 6
+    %). By the amplitudes of the filter alone, whatever moves, they scattered 1.6 times as much."""
+    random, n, rate_hz = np.random.default_rng(7), 5000, 250.0
+    time_s, hz = np.arange(n) / rate_hz, np.fft.rfftfreq(n, 1.0 / rate_hz)
+    x = np.maximum(hz, 1e-3) / 1.1
+    mode = x**4 / ((1.0 - x**2) ** 2 + (0.04 * x) ** 2) / (1.0 + x**6) + 0.05 * (hz < 40.0)
+    loud = np.where((hz > 8.0) & (hz < 30.0), 20.0, 1.0)
+
+    def shaped(amplitude: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        lines = np.fft.rfft(random.standard_normal((n, 3)), axis=0)
+        return np.asarray(np.fft.irfft(lines * amplitude[:, None], n, axis=0))
+
+    over = []
+    for _ in range(60):
+        u = shaped(np.sqrt(mode))
+        u *= 0.03 / u.std(axis=0)
+        V = u + 0.01 * shaped(loud)
+        passes = against_noise(Points(time_s, V, u, np.gradient(u, time_s, axis=0)), np.zeros((2, 3)), knocked=False)
+        assert passes is not None
+        V, u = (own[~np.isnan(own).any(axis=1)] for own in (passes.passed(V), passes.passed(u)))
+        V, u = V - V.mean(axis=0), u - u.mean(axis=0)
+        slopes, rest, *_ = np.linalg.lstsq(u, V, rcond=None)
+        variance = rest / len(u) / passes.independent(np.inf)
+        over.append(np.mean((slopes - np.eye(3)) ** 2 / np.outer(np.diag(np.linalg.inv(u.T @ u)), variance)))
+    assert 0.6 < np.mean(over) < 1.15
