@@ -88,6 +88,8 @@ REVISIONS = (
     Revision(24, "b1bf78ccaf86", "0.3.0"),
     # The last before the lag that a window has by itself is taken out of its samples.
     Revision(25, "eae836b18aa3", "0.3.0"),
+    # The last before the motion tells how the lag changes within a window.
+    Revision(26, "1a5e5ccb6893", "0.3.0"),
 )
 
 

@@ -134,8 +134,8 @@ def test_outputs_that_show_nothing_tell_nothing() -> None:
 
 def test_windows_on_line_keep_their_verdicts_where_reads_are_late() -> None:
     """A crane that blows move, both devices read 20 to 60 ms late: the clocks leave 1 to 3 ms between the middle and
-    the ends of a window open. No window of the first ten contradicts; of windows with that lag in them, four of the first
-    eight did (chi-squared up to 259 where 54 is the limit)."""
+    the ends of a window open. No window of the first ten contradicts; of windows with that lag in them, four of the
+    first eight did (chi-squared up to 259 where 54 is the limit)."""
     made = structure(23)
     house = House(made.building, building_config(made.building, **made.keys))
     for _ in range(10):
