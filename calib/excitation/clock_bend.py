@@ -30,7 +30,7 @@ NOTHING = 1e-9  # of information, relative to that of the clocks
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockBend:
-    """What the lag of the sensor behind the motion is more than its mean, over the time `span_s` of a stretch.
+    """What the lag of the sensor behind the motion is more than its mean, over the time `span_s` of its clock.
 
     `bend_s` (2,): coefficients in s of the first and the second Legendre polynomial; `root` (2, 2): a root of their
     covariance. `slopes` (m, 3): those of V on the reference's own channels.
@@ -47,7 +47,7 @@ class ClockBend:
 
     def taken_out(self, sensor: Samples) -> Samples:
         """The sensor's samples at the times at which they follow the motion best."""
-        return replace(sensor, clock=sensor.clock.bent(-self.bend_s, self.span_s))
+        return replace(sensor, clock=sensor.clock.bent(-self.bend_s))
 
     def left_in(self, points: Points) -> Array:
         """(2, 2k, 3) what the slopes of V on u and du/dt of a window are more, for one standard uncertainty of each of
@@ -126,6 +126,7 @@ def _basis(points: Points) -> Array:
 
 
 def _legendre(time_s: Array, span_s: tuple[float, float]) -> Array:
-    """(2, n) the first and the second Legendre polynomial over a span."""
-    x = np.interp(time_s, span_s, [-1.0, 1.0])
-    return np.asarray([x, 1.5 * x**2 - 0.5])
+    """(2, n) the first and the second Legendre polynomial over a span; straight beyond its ends, as clocks are."""
+    x = (2.0 * time_s - span_s[0] - span_s[1]) / (span_s[1] - span_s[0])
+    inside = np.clip(x, -1.0, 1.0)
+    return np.asarray([x, 1.5 * inside**2 - 0.5 + 3.0 * np.abs(x - inside)])

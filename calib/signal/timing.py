@@ -119,11 +119,11 @@ class ClockFit:
             offset_s=self.offset_s + rate * (self.offset_s - at_s),
         )
 
-    def bent(self, bend_s: Array, span_s: tuple[float, float]) -> ClockFit:
-        """The same clock with the first and the second Legendre polynomial over `span_s`, times `bend_s` (2,) in s,
-        added to its times. Their mean over the span is 0."""
-        middle_s, half_s = 0.5 * (span_s[0] + span_s[1]), 0.5 * (span_s[1] - span_s[0])
-        x = (self.knot_time_s - middle_s) / half_s
+    def bent(self, bend_s: Array) -> ClockFit:
+        """The same clock with the first and the second Legendre polynomial over the time of its knots, times `bend_s`
+        (2,) in s, added to its times. Their mean over this time is 0."""
+        half_s = 0.5 * (self.knot_time_s[-1] - self.knot_time_s[0])
+        x = (self.knot_time_s - self.knot_time_s[0]) / half_s - 1.0
         return replace(
             self,
             knot_time_s=self.knot_time_s + bend_s[0] * x + bend_s[1] * (1.5 * x**2 - 0.5),
