@@ -97,7 +97,7 @@ def _nearer(before: ClockBend, points: Points, unit_s: Array, independent: float
     others, if this is larger: blows are few, and the residuals of each are alike.
     """
     n, m = points.u.shape[0], len(before.slopes)
-    basis = _basis(points)
+    basis = _with_derivatives(points)
     by_motion = regression(basis, points.V.T)
     slopes, rates = by_motion[:, 1 : 1 + m].T, by_motion[:, 1 + points.u.shape[1] :][:, :m].T
     now = replace(before, slopes=slopes)
@@ -123,6 +123,16 @@ def _nearer(before: ClockBend, points: Points, unit_s: Array, independent: float
 def _basis(points: Points) -> Array:
     """(p, n) 1, u and du/dt."""
     return np.vstack([np.ones((1, len(points.u))), points.u.T, points.du.T])
+
+
+def _with_derivatives(points: Points) -> Array:
+    """(p, n) as `_basis`, with the second and the third derivative of the reference's own channels: where instruments
+    delay 14 Hz more than 1 Hz, the lag would seem to change whenever one of them takes the other's place."""
+    rate, more = points.du[:, : own_channels(points.u.shape[1])].T, []
+    for _ in range(2):
+        rate = np.gradient(rate, points.time_s, axis=1)
+        more.append(rate)
+    return np.vstack([_basis(points), *more])
 
 
 def _legendre(time_s: Array, span_s: tuple[float, float]) -> Array:

@@ -63,3 +63,25 @@ def test_an_unknown_begins_with_the_first_window_that_has_it_however_windows_wer
     drift = next(own for own in Unknowns(stated, records).all if own.key == "reference_drift_x of A")
     assert drift.since == 0.0
     assert estimate(records, stated).days[0] == 0.0
+
+
+def test_what_is_open_of_the_lag_within_windows_is_that_of_their_common_slopes() -> None:
+    """The slopes of a merged record differ from those of windows at their true lag by what each window's bend moves
+    them, as least squares over all of them says. Of one part in each of two windows nothing is lost."""
+    random = np.random.default_rng(4)
+    bends = np.zeros((2, 2, 6, 3))
+    bends[:, 0] = 1e-3 * random.normal(size=(2, 6, 3))
+    windows = [
+        replace(
+            told(BESIDE, Truth(S, Q), day), root=np.triu(random.normal(size=(6, 6))) + 3.0 * np.eye(6), lag_bend=bend
+        )
+        for day, bend in enumerate(bends)
+    ]
+    both = merged(windows, S)
+    power = [one.root.T @ one.root for one in windows]
+    moved = [np.linalg.solve(sum(power), P @ bend[0]) for P, bend in zip(power, bends, strict=True)]
+    scatter = sum(np.outer(m.ravel(), m.ravel()) for m in moved)
+    assert both.lag_bend is not None
+    parts = both.lag_bend.reshape(2, -1) / np.sqrt(2.0)
+    np.testing.assert_allclose(parts.T @ parts, scatter, atol=1e-9 * float(np.max(scatter)))
+    np.testing.assert_allclose(windows[0].by_bend[0], (windows[0].root @ bends[0, 0] / windows[0].noise).ravel())
