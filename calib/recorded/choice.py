@@ -245,7 +245,11 @@ class Choice:
         """Keep for the user what was guessed."""
         told = ", ".join(f"{word}={c.column}{f' in {c.unit}' if c.unit else ''}" for word, c in found.items())
         other = f"state others with {self._option}" if self._option else "rename them where others are meant"
-        self.said.append(f"{self._source.path}: columns guessed: {told}; {other}")
+        self.tell(f"columns guessed: {told}; {other}")
+
+    def tell(self, what: str) -> None:
+        """Keep for the user what was found or decided."""
+        self.said.append(f"{self._source.path}: {what}")
 
 
 def quantity_of(chosen: ChosenColumn) -> str | None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from calib.recorded.choice import AXES, Choice, ChosenColumn, quantity_of
 from calib.recorded.errors import InputError
 from calib.recorded.table import REFERENCES, SENSOR
-from calib.recorded.units import Sensitivity, unit_of, unknown_unit
+from calib.recorded.units import Sensitivity, Unit, unit_of, unknown_unit
 
 TEMPERATURE = "temperature_degc"
 ELECTRICAL = ("indication", "count")
@@ -13,16 +15,18 @@ QUANTITIES = {"a": "acceleration", "v": "velocity", "d": "displacement"}  # by t
 
 
 def sensor_columns(choice: Choice) -> list[ChosenColumn]:
-    """Columns of time, x, y, z and, where there is one, temperature. Raises InputError."""
+    """Columns of time, x, y, z and, where there is one, temperature in degC. Raises InputError."""
     if not choice.is_stated and (found := choice.standard(SENSOR)):
-        return [*found, *(choice.standard([TEMPERATURE]) or [])]
+        return [found[0], *of_one_quantity(choice, found[1:]), *(choice.standard([TEMPERATURE]) or [])]
     known = _with_unnamed(choice, _by_role(choice))
     missing = [role for role in ("time", *AXES) if role not in known]
     if missing:
         names = dict(zip(("time", *AXES), SENSOR, strict=True))
         raise choice.fault(f"column {', '.join(names[role] for role in missing)} is missing")
+    channels = of_one_quantity(choice, [known[axis] for axis in AXES])
+    known |= dict(zip(AXES, channels, strict=True))
     temperature = choice.stated("temperature") or choice.guessed("temperature")
-    if temperature and temperature.column.group == known["time"].column.group:
+    if temperature and temperature.column.group == known["time"].column.group and _is_in_degc(choice, temperature):
         known["temperature"] = temperature
     if not choice.is_stated:
         choice.say(known)
@@ -45,15 +49,68 @@ def _with_unnamed(choice: Choice, known: dict[str, ChosenColumn]) -> dict[str, C
     return known
 
 
+def _is_in_degc(choice: Choice, temperature: ChosenColumn) -> bool:
+    """Whether a temperature is in degC, or states no unit. Another one is not taken, which is told."""
+    unit = _known_unit(temperature)
+    if unit is None or unit.quantity == "temperature":
+        return True
+    choice.tell(f"the temperature {str(temperature.column)!r} is in {unit.name}, not in degC; it is left out")
+    return False
+
+
+def of_one_quantity(choice: Choice, channels: Sequence[ChosenColumn]) -> list[ChosenColumn]:
+    """The channels of one device, each with its unit: one that states none has that of the others, which is told.
+
+    Raises InputError where they have no quantity in common, or where their units leave one open.
+    """
+    units = [_known_unit(channel) for channel in channels]
+    stated = list(dict.fromkeys(unit for unit in units if unit))
+    if not stated or units.count(stated[0]) == len(units):
+        return list(channels)
+    none = [channel for channel, unit in zip(channels, units, strict=True) if unit is None]
+    unknown = any(unknown_unit(channel.column.name, channel.unit) for channel in none)
+    if unknown or len({unit.quantity for unit in stated}) > 1 or (none and len(stated) > 1):
+        told = ", ".join(f"{str(channel.column)!r} in {_unit_as_stated(channel)}" for channel in channels)
+        raise choice.fault(f"the units do not go together, {told},")
+    if none:
+        names = ", ".join(repr(str(channel.column)) for channel in none)
+        choice.tell(f"no unit is stated of {names}; {stated[0].name} is taken, as of the others")
+    return [ChosenColumn(c.column, stated[0].name) if c in none else c for c in channels]
+
+
+def _known_unit(channel: ChosenColumn) -> Unit | None:
+    return unit_of(channel.unit) if channel.unit else None
+
+
+def _unit_as_stated(channel: ChosenColumn) -> str:
+    return channel.unit or unknown_unit(channel.column.name, "") or "no unit that is stated"
+
+
+def in_the_first_unit(choice: Choice, channels: Sequence[ChosenColumn]) -> tuple[str, list[float]]:
+    """The unit of the first channel of a sensor, "" where none is known, and what one unit of each channel is in it.
+
+    `channels` are of one quantity. Where they have several units, this is told.
+    """
+    units = [unit for channel in channels if (unit := _known_unit(channel))]
+    if len(units) < len(channels):
+        return "", [1.0] * len(channels)
+    if len(set(units)) > 1:
+        told = ", ".join(f"{str(c.column)!r} in {unit.name}" for c, unit in zip(channels, units, strict=True))
+        choice.tell(f"the columns have several units, {told}; all values are converted to {units[0].name}")
+    return units[0].name, [unit.si / units[0].si for unit in units]
+
+
 def reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[list[ChosenColumn], str]:
     """Columns of time and of one or three channels, and their quantity. Raises InputError."""
     if not choice.is_stated and (standard := _standard_reference(choice)):
         columns, quantity = standard
-        return columns, sensitivity.quantity if sensitivity else quantity
+        channels = of_one_quantity(choice, columns[1:])
+        return [columns[0], *channels], sensitivity.quantity if sensitivity else quantity
     time = choice.stated("time") or choice.guessed("time")
     stated_as, channels = _channels(choice, time)
     if not time or len(channels) not in (1, 3):
         raise choice.fault("expected exactly one of time and one channel, or time and x, y and z,")
+    channels = of_one_quantity(choice, channels)
     told = (sensitivity.quantity if sensitivity else None) or stated_as or quantity_of(channels[0])
     if told is None and len(channels) < 3 and not _is_electrical(channels[0]):
         raise choice.fault(f"neither name nor unit tells what {str(channels[0].column)!r} is, add its unit")
@@ -84,13 +141,13 @@ def _channels(choice: Choice, time: ChosenColumn | None) -> tuple[str | None, li
 
 
 def _is_electrical(chosen: ChosenColumn) -> bool:
-    unit = unit_of(chosen.unit) if chosen.unit else None
+    unit = _known_unit(chosen)
     return unit is not None and unit.quantity in ELECTRICAL
 
 
 def si_of(choice: Choice, chosen: ChosenColumn, sensitivity: Sensitivity | None) -> float:
     """What one unit of the column is in SI units. Raises InputError."""
-    unit = unit_of(chosen.unit) if chosen.unit else None
+    unit = _known_unit(chosen)
     if sensitivity is None:
         if unit is not None and unit.quantity in ELECTRICAL and not choice.can_be_stated:
             raise choice.fault(

@@ -51,6 +51,7 @@ _SPELLINGS = {
     ("indication", 1e-3): "µV uv",
     ("count", 1.0): "count counts lsb cnt cnts digit digits raw",
     ("temperature", 1.0): "degC °c c celsius deg_c",
+    ("temperature, not in degC", 1.0): "K kelvin °f f fahrenheit degf deg_f",
 }
 UNITS = {name.lower(): Unit(*key, names.split()[0]) for key, names in _SPELLINGS.items() for name in names.split()}
 SI_NAMES = {quantity: names.split()[0] for (quantity, si), names in _SPELLINGS.items() if si == 1.0}

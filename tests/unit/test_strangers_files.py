@@ -15,6 +15,7 @@ from agent.cli.main import run_cli
 from agent.reading.dialect import dialect_of
 from agent.reading.source import TableError
 from calib.geometry import STANDARD_GRAVITY_MPS2 as G
+from calib.recorded.arrays import sensor_table
 
 S = np.array([[102.3, 1.1, -0.7], [-0.9, 98.4, 0.6], [0.5, -1.3, 95.1]])
 RATE_HZ, STAY_S = 100.0, 15.0
@@ -203,3 +204,56 @@ def test_times_in_us_in_both_files(tmp_path: Path, calibrate: Calibrate) -> None
     assert status == 2
     assert "1e+04 s apart, at most 10 s beside a reference; if they are in ms or in us, state their unit" in told
     assert time.process_time() - began < 5.0
+
+
+@pytest.mark.parametrize(
+    ("head", "unit", "factors"),
+    [
+        ("Time,Channel A,Channel B,Channel C\n(s),(V),(mV),(mV)", "V", [1.0, 1e-3, 1e-3]),
+        ("Time (s),AccX (m/s2),AccY (g),AccZ (mg)", "m/s2", [1.0, G, 1e-3 * G]),
+        ("time_s,vx,vy,vz\ns,g,g,mg", "g", [1.0, 1.0, 1e-3]),
+        ("Time (s),X (cm/s2),Y (Gal),Z (gal)", "cm/s2", [1.0, 1.0, 1.0]),
+    ],
+)
+def test_axes_in_several_units_are_read_in_that_of_x(
+    head: str, unit: str, factors: list[float], tmp_path: Path
+) -> None:
+    path = written(tmp_path / "s.csv", head, np.arange(9.0), np.tile([1.0, 2.0, 3.0], (9, 1)))
+    found = read_sensor(path)
+    np.testing.assert_allclose(found.v[:2], np.multiply([[1.0, 2.0, 3.0]] * 2, factors), rtol=1e-14)
+    assert found.unit == unit
+    several = [line for line in found.said if f"all values are converted to {unit}" in line]
+    assert bool(several) == (len(set(factors)) > 1)
+
+
+def test_axes_in_several_units_in_a_notebook() -> None:
+    columns = {"time [s]": np.arange(9.0), "x [V]": np.ones(9), "y [mV]": np.ones(9), "z [uV]": np.ones(9)}
+    found = sensor_table(columns)
+    np.testing.assert_allclose(found.v[:1], [[1.0, 1e-3, 1e-6]], rtol=1e-14)
+    assert found.unit == "V"
+
+
+@pytest.mark.parametrize("units", [("g", "V", "V"), ("m/s2", "m/s2", "m/s"), ("V", "V", "EU"), ("g", "", "mg")])
+def test_axes_whose_units_do_not_go_together(units: tuple[str, ...], tmp_path: Path) -> None:
+    head = "Time (s)," + ",".join(f"{axis} ({unit})" if unit else axis for axis, unit in zip("XYZ", units, strict=True))
+    path = written(tmp_path / "s.csv", head, np.arange(9.0), np.ones((9, 3)))
+    told = rf"the units do not go together, 'X.*' in {units[0]}, 'Y.*' in {units[1] or 'no unit'}.*'Z.*' in {units[2]}"
+    for reader in (read_sensor, read_reference):
+        with pytest.raises(TableError, match=told):
+            reader(path)
+
+
+def test_an_axis_without_a_unit_has_that_of_the_others(tmp_path: Path) -> None:
+    path = written(tmp_path / "r.csv", "Time (s),X (g),Y (g),Z", np.arange(9.0), np.ones((9, 3)))
+    for found in (read_sensor(path), read_reference(path)):
+        assert any("no unit is stated of 'Z'; g is taken, as of the others" in line for line in found.said)
+    assert read_sensor(path).unit == "g"
+    np.testing.assert_allclose(read_reference(path).x[:1], [[G, G, G]], rtol=1e-14)
+
+
+@pytest.mark.parametrize(("unit", "taken"), [("°C", True), ("degF", False), ("°F", False), ("K", False)])
+def test_a_temperature_in_another_unit_is_left_out(unit: str, taken: bool, tmp_path: Path) -> None:
+    path = written(tmp_path / "s.csv", f"Time,X,Y,Z,Temp ({unit})", np.arange(9.0), np.ones((9, 4)))
+    found = read_sensor(path)
+    assert (found.temperature_degc is not None) == taken
+    assert any("not in degC; it is left out" in line for line in found.said) != taken
