@@ -33,10 +33,12 @@ MOST_TRACES = 24  # windows kept point by point: the newest window of each of so
 class RecordedSensor:
     """The content of recordings for one sensor; `traces` by position, the newest last.
 
-    `reference_quantity`: what its reference gives; None where there is no reference, or where nothing tells it.
+    `reference`: its name, None where there is none. `reference_quantity`: what the reference gives; None where there is
+    no reference, or where nothing tells it.
     """
 
     sensor: str
+    reference: str | None = None
     reference_quantity: str | None = None
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
     windows: list[WindowReport] = field(default_factory=list)
@@ -63,6 +65,7 @@ def read_recordings(paths: list[Path], sensor: str) -> RecordedSensor:
         channel = next((c for c in _config(path).channels if c.sensor == sensor), None)
         if channel is None:
             raise RecordingError(f"{path}: the recording has no channel with the sensor {sensor!r}")
+        out.reference = channel.reference
         out.reference_quantity = channel.instrument.quantity if channel.reference is not None else None
         reader = RecordingReader(path)
         windows: _WindowStreams | None = None
