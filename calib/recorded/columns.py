@@ -17,14 +17,14 @@ QUANTITIES = {"a": "acceleration", "v": "velocity", "d": "displacement"}  # by t
 def sensor_columns(choice: Choice) -> list[ChosenColumn]:
     """Columns of time, x, y, z and, where there is one, temperature in degC. Raises InputError."""
     if not choice.is_stated and (found := choice.standard(SENSOR)):
-        return [found[0], *of_one_quantity(choice, found[1:]), *(choice.standard([TEMPERATURE]) or [])]
+        check_units(choice, found[1:], else_si=False)
+        return [*found, *(choice.standard([TEMPERATURE]) or [])]
     known = _with_unnamed(choice, _by_role(choice))
     missing = [role for role in ("time", *AXES) if role not in known]
     if missing:
         names = dict(zip(("time", *AXES), SENSOR, strict=True))
         raise choice.fault(f"column {', '.join(names[role] for role in missing)} is missing")
-    channels = of_one_quantity(choice, [known[axis] for axis in AXES])
-    known |= dict(zip(AXES, channels, strict=True))
+    check_units(choice, [known[axis] for axis in AXES], else_si=False)
     temperature = choice.stated("temperature") or choice.guessed("temperature")
     if temperature and temperature.column.group == known["time"].column.group and _is_in_degc(choice, temperature):
         known["temperature"] = temperature
@@ -58,24 +58,16 @@ def _is_in_degc(choice: Choice, temperature: ChosenColumn) -> bool:
     return False
 
 
-def of_one_quantity(choice: Choice, channels: Sequence[ChosenColumn]) -> list[ChosenColumn]:
-    """The channels of one device, each with its unit: one that states none has that of the others, which is told.
-
-    Raises InputError where they have no quantity in common, or where their units leave one open.
-    """
+def check_units(choice: Choice, channels: Sequence[ChosenColumn], *, else_si: bool) -> None:
+    """Raises InputError where the channels of one device have no quantity in common, or where one has no unit, or an
+    unknown one, and those of the others do not tell it. `else_si`: a channel without a unit is in SI."""
     units = [_known_unit(channel) for channel in channels]
-    stated = list(dict.fromkeys(unit for unit in units if unit))
-    if not stated or units.count(stated[0]) == len(units):
-        return list(channels)
-    none = [channel for channel, unit in zip(channels, units, strict=True) if unit is None]
-    unknown = any(unknown_unit(channel.column.name, channel.unit) for channel in none)
-    if unknown or len({unit.quantity for unit in stated}) > 1 or (none and len(stated) > 1):
+    stated = {unit for unit in units if unit}
+    unknown = any(unknown_unit(c.column.name, c.unit) for c, unit in zip(channels, units, strict=True) if unit is None)
+    none_fits = len(stated) == 1 and not unknown and not (else_si and any(unit.si != 1.0 for unit in stated))
+    if len({unit.quantity for unit in stated}) > 1 or (stated and None in units and not none_fits):
         told = ", ".join(f"{str(channel.column)!r} in {_unit_as_stated(channel)}" for channel in channels)
         raise choice.fault(f"the units do not go together, {told},")
-    if none:
-        names = ", ".join(repr(str(channel.column)) for channel in none)
-        choice.tell(f"no unit is stated of {names}; {stated[0].name} is taken, as of the others")
-    return [ChosenColumn(c.column, stated[0].name) if c in none else c for c in channels]
 
 
 def _known_unit(channel: ChosenColumn) -> Unit | None:
@@ -104,13 +96,13 @@ def reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[
     """Columns of time and of one or three channels, and their quantity. Raises InputError."""
     if not choice.is_stated and (standard := _standard_reference(choice)):
         columns, quantity = standard
-        channels = of_one_quantity(choice, columns[1:])
-        return [columns[0], *channels], sensitivity.quantity if sensitivity else quantity
+        check_units(choice, columns[1:], else_si=True)
+        return columns, sensitivity.quantity if sensitivity else quantity
     time = choice.stated("time") or choice.guessed("time")
     stated_as, channels = _channels(choice, time)
     if not time or len(channels) not in (1, 3):
         raise choice.fault("expected exactly one of time and one channel, or time and x, y and z,")
-    channels = of_one_quantity(choice, channels)
+    check_units(choice, channels, else_si=True)
     told = (sensitivity.quantity if sensitivity else None) or stated_as or quantity_of(channels[0])
     if told is None and len(channels) < 3 and not _is_electrical(channels[0]):
         raise choice.fault(f"neither name nor unit tells what {str(channels[0].column)!r} is, add its unit")

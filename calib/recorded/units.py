@@ -89,7 +89,7 @@ _NO_UNIT = re.compile(
 
 def unit_of(text: str) -> Unit | None:
     """The unit that `text` names, None where it names none that is known."""
-    plain = text.strip().strip("[]()").strip().lower().translate(_PLAIN)
+    plain = text.strip().strip("[]").strip().lower().translate(_PLAIN).replace("(", "").replace(")", "").strip()
     return UNITS.get(_ALSO.get(plain, plain))
 
 
@@ -99,7 +99,7 @@ def unit_name(text: str) -> str:
     return "" if unit is None else unit.name
 
 
-_BRACKETS = re.compile(r"(?P<base>.*?)[\s_]*[\[(](?P<unit>[^\])]*)[\])]\s*")
+_BRACKETS = re.compile(r"(?P<base>.*?)[\s_]*[\[(](?P<unit>[^\])]*(?:\([^()]*\))?)[\])]\s*")
 _SUFFIX = re.compile(r"(?P<base>.+)[_ ](?P<unit>[A-Za-z0-9]+)")
 
 

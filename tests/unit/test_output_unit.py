@@ -97,7 +97,7 @@ def words(html: str) -> str:
         (("Acc X (m/s²)", "Acc Y (m/s²)", "Acc Z (m/s²)"), "", "m/s2"),
         (("p", "q", "r"), "--columns=time=time_s,x=p:V,y=q:V,z=r:V", "V"),
         (("vx", "vy", "vz"), "", None),
-        (("X [mV]", "Y", "Z [mV]"), "", "mV"),
+        (("X [mV]", "Y", "Z [mV]"), "", None),
         (("X [EU]", "Y [EU]", "Z [EU]"), "", None),
     ],
 )
