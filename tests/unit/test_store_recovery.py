@@ -92,6 +92,29 @@ def test_what_a_crash_kept_from_the_store_is_fetched_at_the_next_start(tmp_path:
     after.close()
 
 
+def test_an_older_copy_of_the_store_gets_the_results_of_newer_recordings(tmp_path: Path) -> None:
+    """A backup of yesterday. Its numbers would be given again, and consumers take such results for old ones."""
+    results = recorded(tmp_path / "recorded")
+    (tmp_path / "data").mkdir()
+    files = recordings(tmp_path / "recorded")
+    of_first = len(list(scan(files[0][1]).results))
+    yesterday = Store(tmp_path / "data", 0)
+    yesterday.commit(map(plain, results[:of_first]))
+    yesterday.mark_file(files[0][0])
+    yesterday.close()
+    for _, path in files:
+        path.rename(tmp_path / "data" / path.name)
+    today = Store(tmp_path / "data", 0)
+    assert today.recovered.results == len(results) - of_first > 0
+    assert payloads(kept(today)) == payloads([plain(r) for r in results])
+    assert today.last_sequence() == results[-1].sequence + UNKEPT_MAX
+    today.mark_file(files[-1][0])
+    today.close()
+    again = Store(tmp_path / "data", 0)
+    assert (again.recovered.results, again.last_sequence()) == (0, today.last_sequence())
+    again.close()
+
+
 def test_files_before_one_that_lacks_nothing_are_not_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
