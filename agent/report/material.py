@@ -21,7 +21,7 @@ from agent.delivery.calibrations import calibrations, first_in_force
 from agent.delivery.evidence import evidence
 from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.recording.files import recordings
-from agent.report.recorded import RecordedSensor, RecordingError, read_recordings, sensors_of
+from agent.report.recorded import RecordedSensor, RecordingError, in_order_of, read_recordings, sensors_of
 from agent.report.result import (
     CalibrationResult,
     ResultError,
@@ -121,7 +121,8 @@ def _read_result(path: Path) -> CalibrationResult:
 
 def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:
     chosen = _chosen(sensor, list(dict.fromkeys(name for path in paths for name in sensors_of(path))), str(paths[0]))
-    recorded = read_recordings(list(paths), chosen)
+    paths = in_order_of(paths)
+    recorded = read_recordings(paths, chosen)
     material = _of(recorded, [window_verdict(window) for window in recorded.windows], recorded.calibrations)
     material.history = list({update.made: update for update in recorded.calibrations[::-1]}.values())[::-1]
     material.files = [source_file(path) for path in paths]

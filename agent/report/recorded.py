@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from agent.core.schedule import pieces
 from agent.core.snapshot import unpack
 from agent.core.stream import DeviceStream
 from agent.core.windows import margin_of
+from agent.recording.in_order import OrderError, in_order
 from agent.recording.reading import RecordingReader
 from agent.recording.records import FileFault
 from agent.report.trace import Trace
@@ -56,6 +57,14 @@ class RecordingError(Exception):
 def sensors_of(path: Path) -> list[str]:
     """Names of the sensors whose channels a recording holds. Raises RecordingError."""
     return [channel.sensor for channel in _config(path).channels]
+
+
+def in_order_of(paths: Sequence[Path]) -> list[Path]:
+    """Recordings of one gateway, the oldest first. Raises RecordingError."""
+    try:
+        return in_order([(path, _start(path)) for path in paths])
+    except OrderError as error:
+        raise RecordingError(str(error)) from None
 
 
 def read_recordings(paths: list[Path], sensor: str) -> RecordedSensor:
