@@ -56,7 +56,11 @@ _RATE = re.compile(
     re.IGNORECASE,
 )
 _INTERVAL = re.compile(rf"(?:\binterval|sampl\w{{0,8}} (?:period|time)|\bdelta_x\b|\bdt\b){_VALUE}", re.IGNORECASE)
-_UNITS = re.compile(r"[#%/*\s]*(?:\w+ )?units?\s*[:=,;\t][:=,;\s]*(.+)", re.IGNORECASE)
+_UNITS = re.compile(
+    r"[#%/*\s]*(?:(?:eu|y|engineering|measur\w+|channels?|signals?|data|output|acc\w*) )?units?"
+    r"\s*[:=,;\t][:=,;\s]*(.+)",
+    re.IGNORECASE,
+)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "sps": 1.0, "s/s": 1.0}
 _SECONDS = re.compile(r"(?<![a-z])(?:[mun\xb5]s|s|m?sec)(?![a-z])", re.IGNORECASE)
 

@@ -284,7 +284,17 @@ def test_units_that_a_line_of_the_head_states(head: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "line", ["Unit: 4711", "Units: SI", "Temperature unit: degC", "EU Units,g,g", "Unit: V\nUnit: mV", "Time unit: s"]
+    "line",
+    [
+        "Unit: 4711",
+        "Units: SI",
+        "Temperature unit: degC",
+        "EU Units,g,g",
+        "Unit: V\nUnit: mV",
+        "Time unit: s",
+        "Mass unit: g",
+        "Length unit: m",
+    ],
 )
 def test_lines_of_the_head_that_state_no_unit_of_the_channels(line: str, tmp_path: Path) -> None:
     path = tmp_path / "s.csv"
