@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 from pathlib import Path
 
 import pytest
 
 from agent.core.events import Result
+from agent.delivery.evidence import evidence
 from agent.delivery.history import FILE_NAME, History, StoredResult
+from agent.delivery.schema import write_mark
 from agent.delivery.store import Store
 from agent.recording.continuation import UNKEPT_MAX
 from agent.recording.files import RecordingFile, recordings
@@ -176,3 +179,16 @@ def test_the_number_of_a_file_without_an_event_is_used_again(tmp_path: Path) -> 
     recorder.close_torn()
     assert recorder.next_file_sequence == 4
     store.close()
+
+
+def test_what_a_store_lacks_is_said_where_it_is_older_than_the_recordings(tmp_path: Path) -> None:
+    recorded(tmp_path)
+    store = Store(tmp_path, 0)
+    store.close()
+    for mark, said in ((3, []), (1, ["fieldcal-000002.mcap"])):
+        with sqlite3.connect(tmp_path / FILE_NAME) as connection:
+            write_mark(connection, "file", mark)
+        with History(tmp_path / FILE_NAME) as history:
+            told = evidence(history, [], tmp_path)
+        assert [sentence.split()[6] for sentence in told] == said
+        assert all("the next `fieldcal run` adds them" in sentence for sentence in told)
