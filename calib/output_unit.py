@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,8 +48,3 @@ def shown_in(unit: str) -> DisplayUnits:
 
 def _factors(of_sensitivity: float, of_offset: float) -> Array:
     return np.repeat([of_sensitivity, of_offset], (9, 3))
-
-
-def common(units: Sequence[str]) -> str:
-    """The unit of all outputs of a sensor; "" where they have several, or where one has none."""
-    return units[0] if len(set(units)) == 1 else ""

@@ -16,9 +16,8 @@ from agent.reading.ground_motion import GroundMotion
 from agent.reading.source import Array, Progress, Source, TableError
 from agent.reading.spool import Spool, Spooled
 from agent.reading.stationxml import StationChannel
-from calib.output_unit import common
 from calib.recorded.choice import Choice, ChosenColumn
-from calib.recorded.columns import reference_columns, sensor_columns, si_of
+from calib.recorded.columns import in_the_first_unit, reference_columns, sensor_columns, si_of
 from calib.recorded.table import (
     ReferenceTable,
     SensorTable,
@@ -26,7 +25,7 @@ from calib.recorded.table import (
     check_time,
     make_whole,
 )
-from calib.recorded.units import Sensitivity, unit_name
+from calib.recorded.units import Sensitivity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,15 +50,15 @@ class ReferenceFile(ReferenceTable):
 def read_sensor(
     path: Path, progress: Progress | None = None, columns: str | None = None, described: Description = NOT_DESCRIBED
 ) -> SensorFile:
-    """Read the samples of a sensor, in the unit of the file. Raises TableError.
+    """Read the samples of a sensor, in the unit of the file; where it has several, in that of x. Raises TableError.
 
     `columns` is the option --columns.
     """
     with as_table_error(), open_source(path, described, "sensor") as source:
         choice = Choice(source, columns, "--columns")
         chosen = choice.in_one_group(sensor_columns)
-        times, values, restart = _rows(source, chosen, progress, np.ones(len(chosen) - 1))
-        unit = common([unit_name(c.unit) for c in chosen[1:4]])
+        unit, scale = in_the_first_unit(choice, chosen[1:4])
+        times, values, restart = _rows(source, chosen, progress, np.array([*scale, *[1.0] * len(chosen[4:])]))
         said, components = _described(source, choice, chosen[1:4])
         said += unit_warning(path, "--columns", chosen[:4], Spooled(values, slice(0, 3)))
         filters = source.filters.get(chosen[1].column.group, ())

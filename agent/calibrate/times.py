@@ -31,6 +31,9 @@ RESTART_S, PAUSE_S = 1.0, 10.0  # a restart is later than that after 0; a piece 
 FEWEST_BEFORE_S, FEWEST_BEFORE = 2.0, 50  # what a piece lasts before a restart, and its rows; less is disorder
 LONG = frozenset(("min", "mins", "minutes", "h", "hours", "days"))  # units that end the name of a time: time_min
 _BRACKETS = re.compile(r"[\[(]([A-Za-z][^\])]*)[\])]")
+# Units in which devices count, in s; one is taken where the rate in the head tells it within a hundredth.
+TICKS = {1e-3: "ms", 1e-4: "0.1 ms", 1e-6: "us", 1e-7: "0.1 us", 1e-9: "ns"}
+RATE_WITHIN = 0.01
 SLOW_S, FAST_S = 0.5, 2e-6  # usual steps beyond which another unit is meant
 
 
@@ -110,8 +113,16 @@ class Times:
         self._period_s = float(forward.sum()) / max(len(steps), 1) * self._second
 
     def _guess_unit(self) -> None:
-        path, first = self._source.path, self._first
+        path, first, rate_hz = self._source.path, self._first, self._source.rate_hz
         self._second = second_of(first)
+        by_rate = [unit for unit in TICKS if rate_hz and abs(rate_hz * self._usual * unit - 1.0) < RATE_WITHIN]
+        if by_rate and self._second == 1.0:
+            self._second = by_rate[0]
+            self._guessed.append(
+                f"{path}: the times of column {self._name!r} are {self._usual:.4g} apart, and the head states "
+                f"{rate_hz:g} Hz; they are taken in {TICKS[self._second]}"
+            )
+            return
         if COMPACT[0] < first < COMPACT[1]:
             raise TableError(
                 f"{path}, {self._source.place(0)}, column {self._name}: {first:.0f} is a date without marks, and no "

@@ -21,6 +21,7 @@ from agent.certificate.content import (
     ConformityVerdict,
     ResultCertificate,
 )
+from agent.certificate.contradictions import contradictions
 from agent.certificate.provenance import graph
 from agent.certificate.statements import CertificateStatements, DecisionRule
 from agent.core.events import CalibrationUpdate
@@ -37,11 +38,13 @@ FORMAT = 1  # of certificate.json
 def certificate_of(
     material: Material, stated: CertificateStatements, beside: Path, seen: Iterable[Residuals]
 ) -> ResultCertificate:
-    """The certificate of the first result. `beside`: directory of certificate.toml. Raises CertificateError and
-    MaterialError."""
+    """The certificate of the first result. `beside`: directory of certificate.toml. What the data tell otherwise than
+    what is stated is among its warnings. Raises CertificateError and MaterialError."""
     result = material.results[0]
     source = material.files[0].path if material.files else "the input"
     result = replace(result, unit=_unit(result.unit, stated.instrument.output_unit, source))
+    warnings = (*result.warnings, *contradictions(stated, material))
+    result = replace(result, fields={**result.fields, "warnings": list(warnings)})
     stated = _with_reference_name(stated, result)
     residuals, levels = tuple(seen), _levels(material)
     known = np.isfinite(result.values) & np.isfinite(result.expanded_uncertainty)

@@ -91,7 +91,8 @@ def make(inputs: Sequence[Path], output: Path, options: CertificateOptions) -> i
             return _say_refusal(material.results[0].reasons)
         told, text = gather_statements(stated, options.entries, Interview())
         beside = Path() if stated is None else stated.parent
-        written = write(certificate_of(material, told, beside, left_over(material)), output, private, options.xsd, x509)
+        made = certificate_of(material, told, beside, left_over(material))
+        written = write(made, output, private, options.xsd, x509)
         written += _keep_statements(text, output / "certificate.toml", stated)
     except (ConfigError, KeyFileError, MaterialError, SchemaError, CertificateError, OSError) as error:
         for line in _fault_lines(
@@ -101,6 +102,8 @@ def make(inputs: Sequence[Path], output: Path, options: CertificateOptions) -> i
         return 2
     for notice in material.notices:
         say(f"fieldcal certificate: {notice}", err=True)
+    for warning in made.result.warnings:
+        say(f"fieldcal certificate: a warning of the certificate: {warning}", err=True)
     for path in written:
         say(str(path))
     return 0

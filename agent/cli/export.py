@@ -69,7 +69,7 @@ def export(
     recordings: tuple[Path, ...], to: Path | None, mcap: Path | None, device: str | None, rate_hz: float,
     corrected: bool, place: tuple[float, float, float] | None, site_verdicts: Path | None, data_dir: Path | None,
 ) -> int:  # fmt: skip
-    """Write the samples of RECORDING (several: in the order given) with the times of their clock.
+    """Write the samples of RECORDING (several of one gateway: the oldest first) with the times of their clock.
 
     A sensor has its indications and, where it was calibrated, accelerations by the newest calibration. With --corrected
     they are those by S and Q at the time of each sample, by all windows before and after it, and each sample has the
@@ -81,11 +81,13 @@ def export(
     Exit status 0 if the files are written, 2 on bad input.
     """
     from agent.delivery.history import StoreError
+    from agent.export.at_the_end import in_order_of
     from agent.export.samples import ExportError, content_of
     from agent.site_watch.source import WatchError
 
     _check(to, mcap, place, data_dir, site_verdicts, corrected=corrected)
     try:
+        recordings = tuple(in_order_of(recordings))
         content = content_of(recordings, device)
         told = list(content.calibrations)
         _suspect(recordings, content, site_verdicts)

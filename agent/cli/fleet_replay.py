@@ -12,6 +12,7 @@ import click
 import msgspec
 
 from agent.terminal.text import say
+from calib.rounding import plus_minus
 
 if TYPE_CHECKING:
     from agent.fleet.results import Summary
@@ -134,10 +135,7 @@ def _line(summary: Any) -> str:
     told = f"{summary.place}: {summary.events} events, {summary.results} results"
     for update in summary.calibrations:
         S = update["sensitivity"]
-        u = [None if u is None else update["coverage_factor"] * u for u in update["standard_uncertainty"]]
-        values = ", ".join(
-            f"S{axis}{axis} {S[i][i]:.6g}" + ("" if u[4 * i] is None else f" ± {u[4 * i]:.2g}")
-            for i, axis in enumerate("xyz")
-        )
+        U = [None if u is None else update["coverage_factor"] * u for u in update["standard_uncertainty"]]
+        values = ", ".join(f"S{axis}{axis} {plus_minus(S[i][i], U[4 * i])}" for i, axis in enumerate("xyz"))
         told += f"; {update['sensor']} {values} {update['output_unit']} per m/s2"
     return told + again

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from agent.config.files import read_private_file
 from agent.config.key_file import KeyFileError, read_key_file, read_private_key
-from agent.config.sinks import Mqtt, MqttTls
+from agent.config.sinks import HOST_ALONE, Mqtt, MqttTls
 
 if TYPE_CHECKING:
     import ssl
@@ -17,11 +17,14 @@ LARGEST_PASSWORD = 4096  # bytes of its file
 
 
 def broker_faults(settings: Mqtt) -> Iterator[tuple[str, str]]:
-    """Files that cannot be used, and a missing library: (setting within `mqtt`, what is wrong)."""
+    """What lets no connection come about: (setting within `mqtt`, what is wrong). Recordings of earlier versions may
+    have such a host, so the section itself takes it."""
     from importlib.util import find_spec
 
     if find_spec("paho") is None:
         yield "enabled", "the MQTT library is missing; `fieldcal extras --install mqtt` installs it"
+    if settings.host.count(":") == 1:  # an IPv6 address has more
+        yield "host", HOST_ALONE
     if settings.password_file is not None:
         try:
             read_password(settings.password_file)

@@ -12,6 +12,7 @@ from agent.config.section import Endpoint, Section
 from agent.config.tls import TlsFiles
 
 _HOST = re.compile(r"[^\s/\x00]{1,255}")
+HOST_ALONE = "give the name or address alone, as in broker.example.org; the port is a setting of its own"
 _SECRET = re.compile("key|password|secret|token", re.IGNORECASE)  # searched in the part of an endpoint after '#'
 
 
@@ -26,7 +27,7 @@ def _topic(value: str) -> str:
 
 def _host(value: str) -> str:
     if not _HOST.fullmatch(value):
-        raise ValueError("give the name or address alone, as in broker.example.org; the port is a setting of its own")
+        raise ValueError(HOST_ALONE)
     return value
 
 

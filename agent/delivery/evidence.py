@@ -8,23 +8,32 @@ from pathlib import Path
 from agent.config.known_keys import identifier
 from agent.delivery.history import History
 from agent.delivery.record import StoredResult
-from agent.recording.files import recordings
+from agent.recording.files import final_name, recordings
 from agent.recording.result_signing import PUBLIC_KEY, SignedResult
 from agent.recording.results_chain import FILE_METADATA
 from agent.recording.scan import metadata_of
 
 
 def evidence(history: History, shown: Iterable[StoredResult], directory: Path) -> list[str]:
-    """Sentences on the results in `shown`, which `history` gave, and on those that it refused.
+    """Sentences on the results in `shown`, which `history` gave, on those that it refused, and on those that it lacks.
 
-    `directory`: the data directory. Of a gateway that signs nothing, there is nothing to say. Raises OSError.
+    `directory`: the data directory. Raises OSError.
     """
     records = {record.sequence: record for record in shown}
     unsigned = sum(not record.signed for record in records.values())
     said = [f"result {sequence} is refused: {reason}" for sequence, reason in sorted(history.refused.items())]
     if unsigned and (unsigned < len(records) or _signs(directory)):
         said.append(f"{unsigned} of the {len(records)} results shown are not signed, though this gateway has a key")
-    return said
+    return said + _lacking(history, directory)
+
+
+def _lacking(history: History, directory: Path) -> list[str]:
+    """A sentence where finished recordings are newer than the store, as after an older copy of it was put back."""
+    known = history.file_sequence()
+    newer = [path.name for number, path in recordings(directory) if number > known and path.name == final_name(path)]
+    if not newer:
+        return []
+    return [f"the state file is older than {newer[0]} and lacks its results; the next `fieldcal run` adds them"]
 
 
 def signed_with(shown: Iterable[StoredResult]) -> str:

@@ -36,6 +36,7 @@ from agent.delivery.schema import (
 from agent.delivery.signed_states import Digests, StateList, digest_of
 from agent.delivery.states import Completeness, Recall, no_memories, states_at_start
 from agent.recording.continuation import UNKEPT_MAX
+from agent.recording.files import recordings
 
 # Results that a failing disk refused wait in memory for the next commit; beyond this number the oldest are dropped.
 WAITING_MAX = 1000
@@ -267,11 +268,16 @@ class Store:
             epoch = marks.get(EPOCH, secrets.randbits(63))
             self.epoch = f"{epoch:016x}"
             directory = self.path.parent
-            recovered = Recovered() if marks["clean"] else self._recover(everything=new)
-            complete = bool(marks["clean"]) and not recovered.results
+            # An older copy of the store, put back beside the recordings, was closed well too, and lacks their results.
+            # Where there is a key, the signed list of the states tells it (`found.late`).
+            newest = max((number for number, _ in recordings(directory)), default=0)
+            older = self._key is None and newest > marks["file"]
+            clean = bool(marks["clean"]) and not older
+            recovered = Recovered() if clean else self._recover(everything=new)
+            complete = clean and not recovered.results
             store_is: Completeness = "new" if new else "complete" if complete else "behind"
             found = states_at_start(self._connection, directory, recall, self._key, self.epoch, store_is)
-            if found.late and marks["clean"]:
+            if found.late and clean:
                 recovered = self._recover(everything=False)
             recovered.memories = found.replayed
             name_latest(self._connection)
@@ -281,7 +287,7 @@ class Store:
                 self._tell(fault)
             (kept,) = self._connection.execute("SELECT coalesce(max(sequence), 0) FROM results").fetchone()
             self._last = max(kept, marks["floor"], found.sequence)
-            if not marks["clean"] and not new:
+            if not clean and not new:
                 self._last += UNKEPT_MAX
             self._published = marks["published"]
             if new and recovered.results:

@@ -11,7 +11,7 @@ from agent.core.memory import Memory
 from agent.core.past import PastError, budget_in_force
 from agent.core.pipeline import Pipeline
 from agent.delivery.history import History
-from agent.export.at_the_end import starts_of
+from agent.export.at_the_end import in_order_of
 from agent.export.samples import ExportError, followed, start_of, steps_of
 from agent.recording.files import recordings
 from calib.state.sources import Sources
@@ -30,7 +30,7 @@ def budget_of(paths: Sequence[Path], number: int) -> KnownBudget:
 
     Raises ExportError where they do not have it, PastError where windows do not tell it.
     """
-    starts_of(paths)
+    paths = in_order_of(paths)
     found = next(((path, update) for path in paths if (update := _update(path, number)) is not None), None)
     if found is None:
         raise ExportError(f"{paths[0]}: has no calibration with the number {number}; `fieldcal replay` lists its own")

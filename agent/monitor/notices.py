@@ -8,6 +8,8 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
+from functools import partial
+from http.client import HTTPException
 from pathlib import Path
 
 from cryptography.x509 import load_pem_x509_certificate
@@ -18,6 +20,7 @@ from agent.monitor.settings import Notices
 
 LOOK_S = 1.0  # s between two looks at the fleet
 APART_S = 60.0  # s between two messages at least; each has all notices that came meanwhile
+LATE_S = 30.0  # s after which a message that is on its way is told; each answer may take a third of it
 WAITING_MAX = 1000  # notices that wait while nothing can be sent; the oldest are dropped
 CERTIFICATES_S = 3600.0  # s between two looks at the certificates
 AGAIN = timedelta(days=7)  # after which a certificate that ends is told again
@@ -86,52 +89,94 @@ class FleetWatch:
         return found
 
 
-class NoticeSender:
-    """Sends the notices of a watch, in a thread, until `close`.
+class _Target:
+    """A webhook or a mail server, and the notices that wait for it. Each message is sent in a thread of its own, so
+    that a server that never comes to an end delays no other one."""
 
-    `fault`: why the last message was not sent; "" if it was. A message has all notices since the one before. What could
-    not be sent is tried again with the next message.
+    def __init__(self, send: Callable[[Sequence[Notice]], None]) -> None:
+        self._send_to = send
+        self._waiting: list[Notice] = []
+        self._mutex = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._began_s = 0.0
+        self._fault = ""
+
+    def add(self, notices: Sequence[Notice]) -> None:
+        """Let these notices wait. Of too many, the oldest are dropped."""
+        with self._mutex:
+            self._waiting += notices
+            del self._waiting[:-WAITING_MAX]
+
+    def begin(self) -> bool:
+        """Begin to send what waits, unless a message is still on its way. Returns whether it was begun."""
+        if not self._waiting or (self._thread is not None and self._thread.is_alive()):
+            return False
+        self._began_s = time.monotonic()
+        self._thread = threading.Thread(target=self._send, name="notice", daemon=True)
+        self._thread.start()
+        return True
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for a message that is on its way."""
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    @property
+    def fault(self) -> str:
+        """Why the last message was not sent; "" if it was, or is on its way."""
+        late_s = time.monotonic() - self._began_s
+        if self._thread is not None and self._thread.is_alive() and late_s > LATE_S:
+            return f"a notice could not be sent: the server has not come to an end for {late_s:.0f} s"
+        return self._fault
+
+    def _send(self) -> None:
+        with self._mutex:
+            sending, self._waiting = self._waiting, []
+        try:
+            self._send_to(tuple(sending))
+        except (OSError, ValueError, HTTPException, smtplib.SMTPException) as error:
+            self._fault = f"a notice could not be sent: {error or type(error).__name__}"
+            _log.warning("monitor: %s", self._fault)
+            with self._mutex:
+                self._waiting = (sending + self._waiting)[-WAITING_MAX:]
+        else:
+            self._fault = ""
+
+
+class NoticeSender:
+    """Sends the notices of a watch, in threads, until `close`.
+
+    A message has all notices since the one before. What could not be sent is tried again with the next message.
     """
 
     def __init__(self, watch: FleetWatch, settings: Notices) -> None:
-        self.fault = ""
         self._watch = watch
-        self._targets: list[Callable[[Sequence[Notice]], None]] = [
-            lambda notices, url=url: post(url, notices)  # type: ignore[misc]
-            for url in settings.webhooks
-        ]
-        if (email := settings.email) is not None:
-            self._targets.append(lambda notices: mail(email, notices))
-        self._waiting: list[list[Notice]] = [[] for _ in self._targets]
+        self._targets = [_Target(partial(post, url)) for url in settings.webhooks]
+        if settings.email is not None:
+            self._targets.append(_Target(partial(mail, settings.email)))
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
         self._thread.start()
 
+    @property
+    def fault(self) -> str:
+        """Why the last messages were not sent; "" if they were."""
+        return "; ".join(filter(None, (target.fault for target in self._targets)))
+
     def close(self) -> None:
-        """End the thread. A message on its way is waited for, 1 s at most."""
+        """End the thread. Messages on their way are waited for, 1 s at most."""
         self._stop.set()
+        end_s = time.monotonic() + 1.0
         self._thread.join(1.0)
+        for target in self._targets:
+            target.join(max(0.0, end_s - time.monotonic()))
 
     def _run(self) -> None:
         sent_s = -APART_S
         while not self._stop.wait(LOOK_S):
             found = self._watch.update(time.monotonic(), datetime.now(UTC))
-            for waiting in self._waiting:
-                waiting += found
-                del waiting[:-WAITING_MAX]
-            if any(self._waiting) and time.monotonic() - sent_s >= APART_S:
+            for target in self._targets:
+                target.add(found)
+            begun = [target.begin() for target in self._targets] if time.monotonic() - sent_s >= APART_S else []
+            if any(begun):
                 sent_s = time.monotonic()
-                self._send()
-
-    def _send(self) -> None:
-        faults = []
-        for target, waiting in zip(self._targets, self._waiting, strict=True):
-            if not waiting:
-                continue
-            try:
-                target(tuple(waiting))
-                waiting.clear()
-            except (OSError, ValueError, smtplib.SMTPException) as error:
-                faults.append(f"a notice could not be sent: {error}")
-                _log.warning("monitor: %s", faults[-1])
-        self.fault = "; ".join(faults)

@@ -30,12 +30,11 @@ from agent.reading.dialect import (
     dialect_of_text,
     lines_of,
     names_columns,
-    names_time,
     separates_thousands,
 )
 from agent.reading.lines import blocks, text_of
 from agent.reading.source import Array, Column, Progress, Source, TableError
-from calib.recorded.choice import words
+from calib.recorded.choice import names_time, words
 
 BLOCK_BYTES = 1 << 20  # pyarrow parses blocks of a chunk on all cores
 NEWLINE = ord("\n")
@@ -77,7 +76,7 @@ class Delimited(Source):
         parts, rate_hz = self._parts, self.dialect.rate_hz
         self.rate_hz = rate_hz
         unnamed = all(column.name.isdigit() for column in parts) and len(parts) > 3
-        if rate_hz is None or unnamed or any(p.unit == "s" or names_time(p.name) for p in parts.values()):
+        if rate_hz is None or unnamed or any(p.unit == "s" or names_time(p.name, p.unit) for p in parts.values()):
             return
         counter = next((part for part in parts.values() if COUNTERS & set(words(part.name) or [part.name])), None)
         self._parts = {
@@ -91,6 +90,10 @@ class Delimited(Source):
     def pieces(self, columns: Sequence[Column], progress: Progress | None) -> Iterator[Array]:
         """Yield the rows of these columns. Raises TableError for the first line that is wrong."""
         parts = [self._parts[column] for column in columns]
+        for part in parts:
+            if len(part.places) > 1:
+                names = " and ".join(repr(self.dialect.header[place]) for place in part.places)
+                self._say(f"{self.path}: column {part.name!r} is the sum of {names}")
         places = list(dict.fromkeys(place for part in parts for place in part.places))
         plain = len(places) == len(parts) and all(len(part.places) == 1 for part in parts)
         dialect = self._judged(places)

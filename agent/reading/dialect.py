@@ -15,7 +15,8 @@ from pathlib import Path
 from agent.reading.dates import day_of, has_clock, has_day, is_moment, offset_in, order_in, order_of, seconds_of
 from agent.reading.lines import Text, text_of
 from agent.reading.source import TableError
-from calib.recorded.choice import TIME_WORDS, part_of_seconds, words
+from calib.recorded.choice import names_time, part_of_seconds, words
+from calib.recorded.units import split as name_and_unit
 from calib.recorded.units import unit_of
 
 SAMPLE_ROWS = 50  # rows from which the dialect is found
@@ -55,6 +56,11 @@ _RATE = re.compile(
     re.IGNORECASE,
 )
 _INTERVAL = re.compile(rf"(?:\binterval|sampl\w{{0,8}} (?:period|time)|\bdelta_x\b|\bdt\b){_VALUE}", re.IGNORECASE)
+_UNITS = re.compile(
+    r"[#%/*\s]*(?:(?:eu|y|engineering|measur\w+|channels?|signals?|data|output|acc\w*) )?units?"
+    r"\s*[:=,;\t][:=,;\s]*(.+)",
+    re.IGNORECASE,
+)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "sps": 1.0, "s/s": 1.0}
 _SECONDS = re.compile(r"(?<![a-z])(?:[mun\xb5]s|s|m?sec)(?![a-z])", re.IGNORECASE)
 
@@ -259,6 +265,7 @@ def _of_rows(
     before, width = _before(lines, split[: first + 1], delimiter, rows)
     header, header_line, units = _header(before, width)
     head = tuple(lines[: first_line - 1])
+    units = units if any(map(unit_of, units)) else _units_in(head, delimiter, header) or units
     cells = [[row[k] for row in rows if len(row) > k and row[k].lower() not in MISSING] for k in range(width)]
     moments = tuple(map(_moments, cells))
     days = _days(cells, moments)
@@ -269,6 +276,26 @@ def _of_rows(
         order or order_in(" ".join(head)) or order_of(days), _rate_hz(head), fortran,
         frozenset(map(str.strip, head)), lines[header_line - 1].strip() if before and lines else "",
     )  # fmt: skip
+
+
+def _units_in(head: Sequence[str], delimiter: str, header: Sequence[str]) -> tuple[str, ...]:
+    """Units of the columns that a line of the head states, as "Unit: g" or "EU Units,g,g,g"; empty where none does, or
+    where names have units.
+
+    One unit is that of each channel; several are those of the channels in their order.
+    """
+    channels = [k for k, name in enumerate(header) if name and not names_time(name) and not COUNTERS & set(words(name))]
+    told = {
+        tuple(filter(None, map(str.strip, found[1].split(delimiter if delimiter.strip() else None))))
+        for line in head if (found := _UNITS.fullmatch(line.replace('"', "").strip()))
+    }  # fmt: skip
+    stated = told.pop() if len(told) == 1 else ()
+    known = [unit for text in stated if (unit := unit_of(text)) and unit.quantity not in ("time", "temperature")]
+    named = any(name_and_unit(header[k])[1] for k in channels)
+    if not stated or named or len(known) < len(stated) or len(stated) not in (1, len(channels)):
+        return ()
+    of = dict(zip(channels, stated if len(stated) > 1 else stated * len(channels), strict=True))
+    return tuple(of.get(k, "") for k in range(len(header)))
 
 
 def _days(cells: Sequence[list[str]], moments: Sequence[str]) -> list[str]:
@@ -356,7 +383,7 @@ def _parts(
 def _with_time(parts: dict[int, TableColumn], moments: Sequence[str]) -> dict[int, TableColumn]:
     """The parts; the only moment among them is called "time" where no name tells a time."""
     told = [k for k, part in parts.items() if part.unit == "s" and moments[k]]
-    if len(told) != 1 or any(names_time(part.name) for part in parts.values()):
+    if len(told) != 1 or any(names_time(part.name, part.unit) for part in parts.values()):
         return parts
     only = parts[told[0]]
     return parts | {told[0]: TableColumn("time", only.unit, only.places, only.per)}
@@ -386,11 +413,6 @@ def _counts_thousandths(header: Sequence[str], cells: Sequence[Sequence[str]], c
     return all(re.search(r":\d\d$", c) for c in cells[clock]) and all(
         c.isdigit() and len(c) < 4 for c in cells[clock + 1]
     )
-
-
-def names_time(name: str) -> bool:
-    """Whether the name of a column tells a time."""
-    return bool(TIME_WORDS & set(words(name)))
 
 
 def _rate_hz(lines: Sequence[str]) -> float | None:

@@ -53,9 +53,18 @@ FORMATS = (
 )
 BAGS = FORMATS[:3]
 ONE_CHANNEL = "its lines hold one channel: write time, x, y and z as columns of a CSV"
+FIRST_PART = rb"(?s)PK\x03\x04.{26}"  # of a zip archive; its name follows
 # What is not read: how such a file begins, what it is, and what to do with it.
 NOT_READ = (
     (rb'"?TOB[123]"?[,\s]', "TOB, the binary format of Campbell Scientific", "convert it to TOA5 (CardConvert)"),
+    (FIRST_PART + rb"[^\x00/]{1,200}\.npy", "an archive of NumPy (.npz)", "write the arrays as columns of a CSV"),
+    (FIRST_PART + rb"mimetypeapplication/vnd\.oasis", "a document of LibreOffice (.ods)", "write it as .xlsx or CSV"),
+    (
+        FIRST_PART + rb"(?:info\.txt|log\.bin|activity\.bin)",
+        "a file of ActiGraph (.gt3x)",
+        "write it as CSV (ActiLife)",
+    ),
+    (rb"\x93NUMPY", "an array of NumPy (.npy)", "write it as columns of a CSV"),
     (rb"\x1f\x8b|BZh|\xfd7zXZ\x00|\x28\xb5\x2f\xfd|PK\x03\x04|7z\xbc\xaf", "a compressed file", "unpack it"),
     (rb"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "a file of Office before 2007", "write it as .xlsx or CSV"),
     (rb"\xff\xfe\x00\x00|\x00\x00\xfe\xff", "text in UTF-32", "write it in UTF-8"),

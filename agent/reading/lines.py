@@ -16,6 +16,8 @@ HEAD_BYTES = 1 << 16  # the table must begin in these
 CHUNK_BYTES = 1 << 23
 LONGEST_LINE = 1 << 20
 FEWEST_LINES = 3  # before a byte 0: a power cut leaves such bytes behind the text, other formats begin with them
+MOST_CONTROL = 0.02  # part of the bytes of a text; of bytes without order, a tenth are such
+_CONTROL = re.compile(rb"[\x01-\x08\x0e-\x19\x1c-\x1f\x7f]")  # of no text: no end of a line, no page, no escape
 _END = re.compile(r"\r*\n|\r")
 _ENDS = re.compile(rb"\r*\n|\r")
 
@@ -89,7 +91,8 @@ def _encoding(path: Path, head: bytes) -> str:
         return "utf-16-be"
     if zero and not any(head[1::2]):
         return "utf-16-le"
-    if zero and len(_ENDS.findall(before)) < FEWEST_LINES:
+    few_lines = zero and len(_ENDS.findall(before)) < FEWEST_LINES
+    if few_lines or len(_CONTROL.findall(before)) > MOST_CONTROL * len(before):
         raise TableError(f"{path}, line 1: the file is not text, and of no format that is known; write it as CSV")
     try:
         codecs.getincrementaldecoder("utf-8-sig")().decode(before)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,7 +21,7 @@ from agent.delivery.calibrations import calibrations, first_in_force
 from agent.delivery.evidence import evidence
 from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
 from agent.recording.files import recordings
-from agent.report.recorded import RecordedSensor, RecordingError, read_recordings, sensors_of
+from agent.report.recorded import RecordedSensor, RecordingError, in_order_of, read_recordings, sensors_of
 from agent.report.result import (
     CalibrationResult,
     ResultError,
@@ -52,7 +52,8 @@ class Material:
 
     `results`: the calibrations, several if methods are compared. `history`: earlier calibrations in order of time.
     `traces`: windows point by point, by position. `facts`: sensor, devices and program, by name. `notices`: what is
-    missing in the report, and why.
+    missing in the report, and why. `serial_numbers`: of the sensor, "instrument", and of its "reference", as their
+    drivers tell them; "" where a driver tells none.
     """
 
     sensor: str
@@ -62,6 +63,7 @@ class Material:
     facts: dict[str, Any] = field(default_factory=dict)
     files: list[SourceFile] = field(default_factory=list)
     notices: list[str] = field(default_factory=list)
+    serial_numbers: Mapping[str, str] = field(default_factory=dict)
 
 
 def gather(inputs: Sequence[Path], sensor: str | None) -> Material:
@@ -119,7 +121,8 @@ def _read_result(path: Path) -> CalibrationResult:
 
 def _from_recordings(paths: Sequence[Path], sensor: str | None) -> Material:
     chosen = _chosen(sensor, list(dict.fromkeys(name for path in paths for name in sensors_of(path))), str(paths[0]))
-    recorded = read_recordings(list(paths), chosen)
+    paths = in_order_of(paths)
+    recorded = read_recordings(paths, chosen)
     material = _of(recorded, [window_verdict(window) for window in recorded.windows], recorded.calibrations)
     material.history = list({update.made: update for update in recorded.calibrations[::-1]}.values())[::-1]
     material.files = [source_file(path) for path in paths]
@@ -205,7 +208,16 @@ def _of(recorded: RecordedSensor, windows: list[WindowVerdict], calibrations: li
         f"{path}: the recording ends early, at {fault}; only the data before this place are used"
         for path, fault in recorded.faults
     ]
-    return Material(recorded.sensor, [result], traces=recorded.traces, facts=facts, notices=notices)
+    return Material(
+        recorded.sensor, [result], traces=recorded.traces, facts=facts, notices=notices,
+        serial_numbers=_serial_numbers(recorded),
+    )  # fmt: skip
+
+
+def _serial_numbers(recorded: RecordedSensor) -> dict[str, str]:
+    roles = {"instrument": recorded.sensor, "reference": recorded.reference}
+    told = {role: recorded.devices[name] for role, name in roles.items() if name in recorded.devices}
+    return {role: str(msgspec.json.decode(info)["serial_number"]) for role, info in told.items()}
 
 
 def _facts(recorded: RecordedSensor) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,7 @@ from agent.core.schedule import pieces
 from agent.core.snapshot import unpack
 from agent.core.stream import DeviceStream
 from agent.core.windows import margin_of
+from agent.recording.in_order import OrderError, in_order
 from agent.recording.reading import RecordingReader
 from agent.recording.records import FileFault
 from agent.report.trace import Trace
@@ -33,10 +34,12 @@ MOST_TRACES = 24  # windows kept point by point: the newest window of each of so
 class RecordedSensor:
     """The content of recordings for one sensor; `traces` by position, the newest last.
 
-    `reference_quantity`: what its reference gives; None where there is no reference, or where nothing tells it.
+    `reference`: its name, None where there is none. `reference_quantity`: what the reference gives; None where there is
+    no reference, or where nothing tells it.
     """
 
     sensor: str
+    reference: str | None = None
     reference_quantity: str | None = None
     calibrations: list[CalibrationUpdate] = field(default_factory=list)
     windows: list[WindowReport] = field(default_factory=list)
@@ -56,6 +59,14 @@ def sensors_of(path: Path) -> list[str]:
     return [channel.sensor for channel in _config(path).channels]
 
 
+def in_order_of(paths: Sequence[Path]) -> list[Path]:
+    """Recordings of one gateway, the oldest first. Raises RecordingError."""
+    try:
+        return in_order([(path, _start(path)) for path in paths])
+    except OrderError as error:
+        raise RecordingError(str(error)) from None
+
+
 def read_recordings(paths: list[Path], sensor: str) -> RecordedSensor:
     """Read files in the given order, each by itself. Raises RecordingError if one is damaged or cannot be read."""
     out = RecordedSensor(sensor)
@@ -63,6 +74,7 @@ def read_recordings(paths: list[Path], sensor: str) -> RecordedSensor:
         channel = next((c for c in _config(path).channels if c.sensor == sensor), None)
         if channel is None:
             raise RecordingError(f"{path}: the recording has no channel with the sensor {sensor!r}")
+        out.reference = channel.reference
         out.reference_quantity = channel.instrument.quantity if channel.reference is not None else None
         reader = RecordingReader(path)
         windows: _WindowStreams | None = None

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from calib.model import Array
-from calib.output_unit import common
 from calib.recorded.choice import Choice, ChosenColumn, Column
-from calib.recorded.columns import reference_columns, sensor_columns, si_of
+from calib.recorded.columns import in_the_first_unit, reference_columns, sensor_columns, si_of
 from calib.recorded.errors import InputError
 from calib.recorded.poses import AXIS, SPAN, PoseRow, Poses, columns_of
 from calib.recorded.table import (
@@ -26,7 +25,7 @@ from calib.recorded.table import (
     make_whole,
     second_of,
 )
-from calib.recorded.units import unit_name, unit_of
+from calib.recorded.units import unit_of
 
 REFERENCE_HEADERS = " | ".join(",".join(("time_s", *names)) for names in REFERENCES)
 BY_QUANTITY = {quantity: names for names, quantity in REFERENCES.items()}  # the last of a quantity: one channel
@@ -43,7 +42,7 @@ class _Frame:
 
 
 def sensor_table(given: Any) -> SensorTable:
-    """The samples of a sensor, in the unit of the table. Raises InputError."""
+    """The samples of a sensor, in the unit of the table; where it has several, in that of x. Raises InputError."""
     place = "sensor"
     columns = _columns(given, SENSOR, place)
     if "time_s" in columns and set(SENSOR[1:]) & set(columns):
@@ -51,8 +50,8 @@ def sensor_table(given: Any) -> SensorTable:
         return SensorTable(place, rows[:, 0], rows[:, 1:])
     choice = Choice(_Frame(place, columns))
     chosen = sensor_columns(choice)[:4]
-    unit = common([unit_name(each.unit) for each in chosen[1:]])
-    rows = _chosen_rows(columns, chosen, np.ones(3), place)
+    unit, scale = in_the_first_unit(choice, chosen[1:])
+    rows = _chosen_rows(columns, chosen, np.array(scale), place)
     return SensorTable(place, rows[:, 0], rows[:, 1:], None, tuple(choice.said), unit)
 
 

@@ -23,6 +23,8 @@ QUANTITY_WORDS = {
     "velocity": frozenset(["v", "vel", "velocity", "speed"]),
     "displacement": frozenset(["d", "disp", "displacement", "position"]),
 }
+_DEGREES = re.compile(r"(?:°|deg(?:rees?)?)[ _]?[cfk]?|celsius|fahrenheit|kelvin|[cfk]", re.IGNORECASE)
+_IN_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 _OTHER_AXES = re.compile(r"(gyr|mag|ang|rot|quat|eul|vel|pos|disp|orient|cov|omega|grav)")
 _AXIS = re.compile(r"(?:a|v|s|acc|accel|acceleration|accelerometer)?([xyz])")
 AXES = ("x", "y", "z")
@@ -245,7 +247,11 @@ class Choice:
         """Keep for the user what was guessed."""
         told = ", ".join(f"{word}={c.column}{f' in {c.unit}' if c.unit else ''}" for word, c in found.items())
         other = f"state others with {self._option}" if self._option else "rename them where others are meant"
-        self.said.append(f"{self._source.path}: columns guessed: {told}; {other}")
+        self.tell(f"columns guessed: {told}; {other}")
+
+    def tell(self, what: str) -> None:
+        """Keep for the user what was found or decided."""
+        self.said.append(f"{self._source.path}: {what}")
 
 
 def quantity_of(chosen: ChosenColumn) -> str | None:
@@ -279,6 +285,13 @@ def words(name: str) -> list[str]:
     return re.findall(r"[a-z]+|\d+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower())
 
 
+def names_time(name: str, unit: str = "") -> bool:
+    """Whether the name of a column tells a time. T in degrees, in brackets or in the row of units, is a temperature."""
+    found = _IN_BRACKETS.search(name)
+    in_degrees = _DEGREES.fullmatch((unit or (found[1] if found else "")).strip("[]() "))
+    return bool(TIME_WORDS & set(words(split(name)[0]))) and not in_degrees
+
+
 def part_of_seconds(whole: str, part: str) -> float:
     """How many s are one unit of the column `part`, where by their names it has the parts of the seconds in the column
     `whole`; otherwise 0."""
@@ -289,9 +302,9 @@ def part_of_seconds(whole: str, part: str) -> float:
 
 def _role(column: Column) -> str:
     told = words(split(column.name)[0])
-    if TIME_WORDS & set(told):
+    if names_time(column.name, column.unit):
         return "time"
-    if TEMPERATURE_WORDS & set(told):
+    if TEMPERATURE_WORDS & set(told) or TIME_WORDS & set(told):
         return "temperature"
     if not told or any(_OTHER_AXES.match(word) for word in told):
         return ""

@@ -51,6 +51,7 @@ _SPELLINGS = {
     ("indication", 1e-3): "µV uv",
     ("count", 1.0): "count counts lsb cnt cnts digit digits raw",
     ("temperature", 1.0): "degC °c c celsius deg_c",
+    ("temperature, not in degC", 1.0): "K kelvin °f f fahrenheit degf deg_f",
 }
 UNITS = {name.lower(): Unit(*key, names.split()[0]) for key, names in _SPELLINGS.items() for name in names.split()}
 SI_NAMES = {quantity: names.split()[0] for (quantity, si), names in _SPELLINGS.items() if si == 1.0}
@@ -88,7 +89,7 @@ _NO_UNIT = re.compile(
 
 def unit_of(text: str) -> Unit | None:
     """The unit that `text` names, None where it names none that is known."""
-    plain = text.strip().strip("[]()").strip().lower().translate(_PLAIN)
+    plain = text.strip().strip("[]").strip().lower().translate(_PLAIN).replace("(", "").replace(")", "").strip()
     return UNITS.get(_ALSO.get(plain, plain))
 
 
@@ -98,7 +99,7 @@ def unit_name(text: str) -> str:
     return "" if unit is None else unit.name
 
 
-_BRACKETS = re.compile(r"(?P<base>.*?)[\s_]*[\[(](?P<unit>[^\])]*)[\])]\s*")
+_BRACKETS = re.compile(r"(?P<base>.*?)[\s_]*[\[(](?P<unit>[^\])]*(?:\([^()]*\))?)[\])]\s*")
 _SUFFIX = re.compile(r"(?P<base>.+)[_ ](?P<unit>[A-Za-z0-9]+)")
 
 

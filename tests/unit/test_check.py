@@ -17,7 +17,9 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from agent.cli.main import run_cli
 from agent.cli.stopping import STOP_SIGNALS
+from agent.config.broker import broker_faults
 from agent.config.endpoints import endpoint_fault
+from agent.config.sinks import Mqtt
 from agent.config.syntax import syntax_fault
 
 GOOD = """[gateway]
@@ -289,6 +291,15 @@ def test_a_fault_names_line_path_and_remedy(
 )  # fmt: skip
 def test_an_endpoint_that_would_connect_to_nothing_is_a_fault(endpoint: str, told: str) -> None:
     assert endpoint_fault(endpoint) == told
+
+
+@pytest.mark.parametrize(
+    ("host", "faults"), [("broker.local:1883", 1), ("192.0.2.1:1883", 1), ("::1", 0), ("broker", 0)]
+)
+def test_a_broker_is_a_host_without_its_port(host: str, faults: int) -> None:
+    told = [what for setting, what in broker_faults(Mqtt(enabled=True, host=host)) if setting == "host"]
+    assert len(told) == faults
+    assert all("the port is a setting of its own" in what for what in told)
 
 
 COMMA = "a comma stands between two entries of a list; add it at the end"

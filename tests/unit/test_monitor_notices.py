@@ -165,6 +165,40 @@ def test_what_could_not_be_sent_is_sent_with_the_next_message(monkeypatch: pytes
     assert texts == [*["site/gw/mems: HELD: first"] * 2, "site/gw/mems: HELD: second"]
 
 
+def serve_badly(listening: socket.socket, answers: list[bytes], ended: threading.Event) -> None:
+    """Answer the first requests with these bytes, and the next one never."""
+    held = []
+    while not ended.is_set():
+        connection, _ = listening.accept()
+        connection.recv(1 << 16)
+        if answers:
+            connection.sendall(answers.pop(0))
+            connection.close()
+        else:
+            held.append(connection)
+
+
+def test_a_server_that_answers_badly_or_never_delays_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer that is no HTTP once ended the thread, and nobody was told of anything any more."""
+    monkeypatch.setattr(notices_module, "LOOK_S", 0.01)
+    monkeypatch.setattr(notices_module, "APART_S", 0.05)
+    monkeypatch.setattr(notices_module, "LATE_S", 0.3)
+    fleet, ended = Fleet(), threading.Event()
+    with hooked(200) as good, socket.create_server(("127.0.0.1", 0)) as listening:
+        bad = threading.Thread(target=serve_badly, args=(listening, [b"what?\r\n\r\n"], ended), daemon=True)
+        bad.start()
+        settings = Notices(webhooks=(f"http://127.0.0.1:{listening.getsockname()[1]}/", good.url))
+        notifier = NoticeSender(FleetWatch(fleet, settings, []), settings)
+        fleet.take(*PLACE, "status", held("first"))
+        wait_for(lambda: len(good.taken) == 1)
+        wait_for(lambda: "the server has not come to an end" in notifier.fault)
+        fleet.take(*PLACE, "status", held("second"))
+        wait_for(lambda: len(good.taken) == 2)
+        ended.set()
+        notifier.close()
+    assert json.loads(good.taken[1])["text"] == "site/gw/mems: HELD: second"
+
+
 def serve_mail(listening: socket.socket, taken: list[bytes]) -> None:
     """One session of a mail server that takes everything."""
     connection, _ = listening.accept()

@@ -98,7 +98,7 @@ def words(html: str) -> str:
         (("p", "q", "r"), "--columns=time=time_s,x=p:V,y=q:V,z=r:V", "V"),
         (("vx", "vy", "vz"), "", None),
         (("X [mV]", "Y", "Z [mV]"), "", None),
-        (("X [mV]", "Y [V]", "Z [mV]"), "", None),
+        (("X [EU]", "Y [EU]", "Z [EU]"), "", None),
     ],
 )
 def test_the_result_has_the_unit_that_all_three_columns_have(

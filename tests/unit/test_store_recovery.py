@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 from pathlib import Path
 
 import pytest
 
 from agent.core.events import Result
+from agent.delivery.evidence import evidence
 from agent.delivery.history import FILE_NAME, History, StoredResult
+from agent.delivery.schema import write_mark
 from agent.delivery.store import Store
 from agent.recording.continuation import UNKEPT_MAX
 from agent.recording.files import RecordingFile, recordings
@@ -92,6 +95,29 @@ def test_what_a_crash_kept_from_the_store_is_fetched_at_the_next_start(tmp_path:
     after.close()
 
 
+def test_an_older_copy_of_the_store_gets_the_results_of_newer_recordings(tmp_path: Path) -> None:
+    """A backup of yesterday. Its numbers would be given again, and consumers take such results for old ones."""
+    results = recorded(tmp_path / "recorded")
+    (tmp_path / "data").mkdir()
+    files = recordings(tmp_path / "recorded")
+    of_first = len(list(scan(files[0][1]).results))
+    yesterday = Store(tmp_path / "data", 0)
+    yesterday.commit(map(plain, results[:of_first]))
+    yesterday.mark_file(files[0][0])
+    yesterday.close()
+    for _, path in files:
+        path.rename(tmp_path / "data" / path.name)
+    today = Store(tmp_path / "data", 0)
+    assert today.recovered.results == len(results) - of_first > 0
+    assert payloads(kept(today)) == payloads([plain(r) for r in results])
+    assert today.last_sequence() == results[-1].sequence + UNKEPT_MAX
+    today.mark_file(files[-1][0])
+    today.close()
+    again = Store(tmp_path / "data", 0)
+    assert (again.recovered.results, again.last_sequence()) == (0, today.last_sequence())
+    again.close()
+
+
 def test_files_before_one_that_lacks_nothing_are_not_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,3 +179,16 @@ def test_the_number_of_a_file_without_an_event_is_used_again(tmp_path: Path) -> 
     recorder.close_torn()
     assert recorder.next_file_sequence == 4
     store.close()
+
+
+def test_what_a_store_lacks_is_said_where_it_is_older_than_the_recordings(tmp_path: Path) -> None:
+    recorded(tmp_path)
+    store = Store(tmp_path, 0)
+    store.close()
+    for mark, said in ((3, []), (1, ["fieldcal-000002.mcap"])):
+        with sqlite3.connect(tmp_path / FILE_NAME) as connection:
+            write_mark(connection, "file", mark)
+        with History(tmp_path / FILE_NAME) as history:
+            told = evidence(history, [], tmp_path)
+        assert [sentence.split()[6] for sentence in told] == said
+        assert all("the next `fieldcal run` adds them" in sentence for sentence in told)

@@ -15,6 +15,7 @@ from agent.cli.main import run_cli
 from agent.reading.dialect import dialect_of
 from agent.reading.source import TableError
 from calib.geometry import STANDARD_GRAVITY_MPS2 as G
+from calib.recorded.arrays import sensor_table
 
 S = np.array([[102.3, 1.1, -0.7], [-0.9, 98.4, 0.6], [0.5, -1.3, 95.1]])
 RATE_HZ, STAY_S = 100.0, 15.0
@@ -143,6 +144,11 @@ def test_columns_whose_names_tell_an_order(names: str, read: str, tmp_path: Path
     [
         (b'"TOB1","CR6"\r\n"SECONDS","NANOSECONDS","RECORD"\r\n"","",""\r\n' + bytes(range(256)), "convert it to TOA5"),
         (b"\x1f\x8b\x08\x00abc", "unpack it"), (b"PK\x03\x04s.csv", "unpack it"),
+        (b"PK\x03\x04" + bytes(26) + b"arr_0.npy\x93NUMPY", r"an archive of NumPy \(.npz\)"),
+        (b"PK\x03\x04" + bytes(26) + b"info.txt", r"ActiGraph \(.gt3x\)"),
+        (b"PK\x03\x04" + bytes(26) + b"mimetypeapplication/vnd.oasis.opendocument", r"LibreOffice \(.ods\)"),
+        (b"\x93NUMPY\x01\x00", "an array of NumPy"),
+        (np.random.default_rng(1).integers(1, 256, 4000, np.uint8).tobytes(), "the file is not text"),
         (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "write it as .xlsx"),
         ("time_s,vx,vy,vz\n".encode("utf-32"), "write it in UTF-8"),
         (b'{"t": 0, "x": 1}\n', "it is JSON"), (b'[{"t": 0}]', "it is JSON"), (b"<?xml version='1.0'?>", "it is XML"),
@@ -203,3 +209,136 @@ def test_times_in_us_in_both_files(tmp_path: Path, calibrate: Calibrate) -> None
     assert status == 2
     assert "1e+04 s apart, at most 10 s beside a reference; if they are in ms or in us, state their unit" in told
     assert time.process_time() - began < 5.0
+
+
+@pytest.mark.parametrize(
+    ("head", "unit", "factors"),
+    [
+        ("Time,Channel A,Channel B,Channel C\n(s),(V),(mV),(mV)", "V", [1.0, 1e-3, 1e-3]),
+        ("Time (s),AccX (m/s2),AccY (g),AccZ (mg)", "m/s2", [1.0, G, 1e-3 * G]),
+        ("time_s,vx,vy,vz\ns,g,g,mg", "g", [1.0, 1.0, 1e-3]),
+        ("Time (s),X (cm/s2),Y (Gal),Z (gal)", "cm/s2", [1.0, 1.0, 1.0]),
+    ],
+)
+def test_axes_in_several_units_are_read_in_that_of_x(
+    head: str, unit: str, factors: list[float], tmp_path: Path
+) -> None:
+    path = written(tmp_path / "s.csv", head, np.arange(9.0), np.tile([1.0, 2.0, 3.0], (9, 1)))
+    found = read_sensor(path)
+    np.testing.assert_allclose(found.v[:2], np.multiply([[1.0, 2.0, 3.0]] * 2, factors), rtol=1e-14)
+    assert found.unit == unit
+    several = [line for line in found.said if f"all values are converted to {unit}" in line]
+    assert bool(several) == (len(set(factors)) > 1)
+
+
+def test_axes_in_several_units_in_a_notebook() -> None:
+    columns = {"time [s]": np.arange(9.0), "x [V]": np.ones(9), "y [mV]": np.ones(9), "z [uV]": np.ones(9)}
+    found = sensor_table(columns)
+    np.testing.assert_allclose(found.v[:1], [[1.0, 1e-3, 1e-6]], rtol=1e-14)
+    assert found.unit == "V"
+
+
+@pytest.mark.parametrize("units", [("g", "V", "V"), ("m/s2", "m/s2", "m/s"), ("V", "V", "EU"), ("g", "", "mg")])
+def test_axes_whose_units_do_not_go_together(units: tuple[str, ...], tmp_path: Path) -> None:
+    head = "Time (s)," + ",".join(f"{axis} ({unit})" if unit else axis for axis, unit in zip("XYZ", units, strict=True))
+    path = written(tmp_path / "s.csv", head, np.arange(9.0), np.ones((9, 3)))
+    told = rf"the units do not go together, 'X.*' in {units[0]}, 'Y.*' in {units[1] or 'no unit'}.*'Z.*' in {units[2]}"
+    for reader in (read_sensor, read_reference):
+        with pytest.raises(TableError, match=told):
+            reader(path)
+
+
+def test_an_axis_without_a_unit_beside_others_in_g(tmp_path: Path) -> None:
+    """Of a sensor it changes no value, and the unit is not known; that of a reference would be taken in m/s2."""
+    path = written(tmp_path / "r.csv", "Time (s),X (g),Y (g),Z", np.arange(9.0), np.ones((9, 3)))
+    assert read_sensor(path).unit == ""
+    with pytest.raises(TableError, match=r"do not go together, 'X \(g\)' in g, .* 'Z' in no unit that is stated"):
+        read_reference(path)
+
+
+@pytest.mark.parametrize(("unit", "taken"), [("°C", True), ("degF", False), ("°F", False), ("K", False)])
+def test_a_temperature_in_another_unit_is_left_out(unit: str, taken: bool, tmp_path: Path) -> None:
+    path = written(tmp_path / "s.csv", f"Time,X,Y,Z,Temp ({unit})", np.arange(9.0), np.ones((9, 4)))
+    found = read_sensor(path)
+    assert (found.temperature_degc is not None) == taken
+    assert any("not in degC; it is left out" in line for line in found.said) != taken
+
+
+ROWS = "".join(f"{k / 100:.2f},1,2,3\n" for k in range(20))
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "Test ID,RUN_1\nEU Units,g,g,g\nTime,Chan 0:Acc X,Chan 1:Acc Y,Chan 2:Acc Z\n",
+        "Sampling rate:,100 Hz\nUnit:,g\n\nTime,Ch_X,Ch_Y,Ch_Z\n",
+        "# Unit: g\nTime,X,Y,Z\n",
+        "Time,X,Y,Z\ns,g,g,g\n",
+    ],
+)
+def test_units_that_a_line_of_the_head_states(head: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text(head + ROWS)
+    assert read_sensor(path).unit == "g"
+    np.testing.assert_allclose(read_reference(path).x[:1], [[G, 2 * G, 3 * G]], rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "Unit: 4711",
+        "Units: SI",
+        "Temperature unit: degC",
+        "EU Units,g,g",
+        "Unit: V\nUnit: mV",
+        "Time unit: s",
+        "Mass unit: g",
+        "Length unit: m",
+    ],
+)
+def test_lines_of_the_head_that_state_no_unit_of_the_channels(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text(f"{line}\nTime,X,Y,Z\n{ROWS}")
+    assert read_sensor(path).unit == ""
+
+
+def test_units_in_names_come_before_those_of_the_head(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text(f"Unit: g\nTime,X (mg),Y (mg),Z (mg)\n{ROWS}")
+    assert read_sensor(path).unit == "mg"
+
+
+@pytest.mark.parametrize("unit", ["m/(s^2)", "(m/(s^2))", "[m/(s²)]", "m/(s2)"])
+def test_a_unit_with_brackets(unit: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text(f"Time,X,Y,Z\ns,{unit},{unit},{unit}\n{ROWS}")
+    assert read_sensor(path).unit == "m/s2"
+    path.write_text(f"Time,X [{unit}],Y [{unit}],Z [{unit}]\n{ROWS}" if unit[0] == "m" else f"time_s,x,y,z\n{ROWS}")
+    assert read_sensor(path).unit == ("m/s2" if unit[0] == "m" else "")
+
+
+@pytest.mark.parametrize("head", ["Time(s),ax(g),ay(g),az(g),T(°)", "Time,X,Y,Z,T\ns,g,g,g,Deg C", "t,x,y,z,T [°C]"])
+def test_t_in_degrees_is_a_temperature_and_no_time(head: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text(head + "\n" + ROWS.replace(",3\n", ",3,25\n"))
+    found = read_sensor(path)
+    assert found.time_s[:2].tolist() == [0.0, 0.01]
+    assert found.temperature_degc is not None
+    assert found.temperature_degc[:1].tolist() == [25.0]
+
+
+@pytest.mark.parametrize(("tick", "rate_hz", "told"), [(1e-6, 100, "us"), (1e-4, 100, "0.1 ms"), (1e-3, 125, "ms")])
+def test_a_time_whose_unit_the_rate_in_the_head_tells(tick: float, rate_hz: int, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    step = round(1.0 / rate_hz / tick)
+    rows = "".join(f"{k},{7 * step + k * step},1,2,3\n" for k in range(20))
+    path.write_text(f"OutputRate:,{rate_hz}Hz\n\nPacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z\n{rows}")
+    found = read_sensor(path)
+    np.testing.assert_allclose(np.diff(found.time_s[:]), 1.0 / rate_hz, rtol=1e-9)
+    assert any(f"the head states {rate_hz} Hz; they are taken in {told}" in line for line in found.said)
+
+
+def test_a_time_of_several_columns_names_them(tmp_path: Path) -> None:
+    path = tmp_path / "s.csv"
+    path.write_text("secs,nsecs,x,y,z\n" + "".join(f"1700000000,{k}00000000,1,2,3\n" for k in range(9)))
+    assert any("column 'secs' is the sum of 'secs' and 'nsecs'" in line for line in read_sensor(path).said)
