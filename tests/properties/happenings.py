@@ -92,7 +92,7 @@ def happenings(seed: int, events: int, *, moving: bool) -> Iterator[Event]:
 
 
 def calm(blocks: int) -> Iterator[Event]:
-    """So many blocks of half a second of a sensor without an error, and of its reference, in the positions of `config`."""
+    """So many blocks of half a second of a sensor without an error and of its reference, as `config` turns them."""
     rng = np.random.default_rng(0)
     sensor, reference = _Device("s", 3, 0.0, nonsense=0.0), _Device("r", 1, 3.0, nonsense=0.0)
     poses = [clamp(*np.radians((THETA_DEG, alpha))) for alpha in ALPHAS_DEG]
