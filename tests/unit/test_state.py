@@ -119,6 +119,17 @@ def test_what_was_not_excited_stays_to_the_last_digit() -> None:
     np.testing.assert_allclose(found.result().standard_uncertainty[OTHERS], U[OTHERS], rtol=1e-9)
 
 
+def test_windows_along_nearly_one_direction_excite_no_other() -> None:
+    """0.01 rad to both sides of it: across, they moved 1e-4 times as much, and a state counts less than 1e-3 as none."""
+    random, found = np.random.default_rng(1), mounted()
+    for k in range(6):
+        way = np.array([0.01 * (-1) ** k, 1.0, 0.0])
+        record = Record.of(building_window(random), k / 24)
+        found.update(replace(record, excited=np.outer(way, way) / (way @ way)))
+    assert found.unexcited.shape == (2, 3)
+    np.testing.assert_allclose(found.unexcited[:, 1], 0.0, atol=1e-3)
+
+
 def test_motion_that_goes_along_is_none_of_the_excited_column() -> None:
     # x moves along with y at 0.9 % of it, too little to tell S_x by, enough to put 1 % into S_xy if it were left out.
     random, found = np.random.default_rng(2), mounted()
