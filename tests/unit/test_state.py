@@ -120,7 +120,7 @@ def test_what_was_not_excited_stays_to_the_last_digit() -> None:
 
 
 def test_windows_along_nearly_one_direction_excite_no_other() -> None:
-    """0.01 rad to both sides of it: across, they moved 1e-4 times as much, and a state counts less than 1e-3 as none."""
+    """0.01 rad to both sides of it: across, they moved 1e-4 times as much, and less than 1e-3 counts as nothing."""
     random, found = np.random.default_rng(1), mounted()
     for k in range(6):
         way = np.array([0.01 * (-1) ** k, 1.0, 0.0])
