@@ -39,8 +39,9 @@ pictures: $(VENV)/development  ## the pictures of README and docs that show runn
 # Tests of running programs against the clock can fail where other work delays them. What failed runs once more, alone.
 once_more = { test $$? = 1 && $(BIN)/python -m pytest --last-failed --last-failed-no-failures none $(1); }
 
-# Two for each processor: one of them takes scenarios, which mostly wait for programs that they start (tests/conftest.py).
-PROCESSES = $$((2 * $$(nproc)))
+# Five for two processors: two of them take scenarios, which mostly wait for programs that they start, and three the other
+# tests, of which some wait too (tests/conftest.py). With two and two a sixth of the processors' time was not used.
+PROCESSES = $$((5 * $$(nproc) / 2))
 
 # $(1): processes; $(2): which tests
 tested = $(BIN)/python -m pytest -n $(1) --dist loadscope --no-loadscope-reorder $(2)
@@ -55,7 +56,7 @@ test: $(VENV)/development  ## before a merge: what decides whether results, unce
 # The drivers' contract reads 1,000 samples here.
 test-quick: export FIELDCAL_CONTRACT_SAMPLES = 1000
 test-quick: $(VENV)/development  ## before a commit: modules, properties and drivers, in under two minutes
-	$(call tested,$(PROCESSES),-m "not faults and not thorough and not slow" tests/unit tests/properties tests/contract)
+	$(call tested,$$((2 * $$(nproc))),-m "not faults and not thorough and not slow" tests/unit tests/properties tests/contract)
 
 test-thorough: $(VENV)/development  ## what `make test` leaves out: worlds of months, other adapters, more seeds
 	$(call tested,$(PROCESSES),-m "thorough and not nightly") || $(call once_more,-m "thorough and not nightly")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import selectors
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
@@ -18,6 +18,8 @@ from hw.serial_sensor import LOST, READ_BYTES, reason_of
 
 FIRST_LINE_S = 5.0  # opening the port restarts some boards, which need two seconds
 LISTEN_S = 3.0  # a burst of 20 ms at each end changes the rate by 1 % at most
+LONGER_S = 7.0  # beyond LISTEN_S at most, where fewer lines than ENOUGH_LINES have come by then
+ENOUGH_LINES = 100  # a counter that begins anew after 50 or 60 numbers has done so: it is no sample counter
 FEWEST_LINES = 8
 MOST_BYTES = 1 << 22  # 4 Mbaud for ten seconds
 # Rates of data sheets. A device whose counted rate is nearer than this to one of them has it as its nominal rate.
@@ -79,23 +81,30 @@ def hear(ports: Mapping[str, int]) -> dict[str, PortLines | str]:
 
 
 def _collect(lines: Mapping[str, _PortBytes]) -> None:
+    ports = lines.values()
     with selectors.DefaultSelector() as selector:
-        for line in lines.values():
+        for line in ports:
             selector.register(line.port.fileno(), selectors.EVENT_READ, line)
-        latest_s, ends = time.monotonic() + FIRST_LINE_S, False
-        while (now_s := time.monotonic()) < latest_s and selector.get_map():
-            for key, _ in selector.select(latest_s - now_s):
-                line = key.data
-                data = b""
-                with contextlib.suppress(*LOST):
-                    data = line.port.read(READ_BYTES)
-                if not data or len(line.data) > MOST_BYTES:
-                    selector.unregister(key.fileobj)
-                    continue
-                line.data += with_newlines(data)
-                line.arrivals.append((time.monotonic(), len(line.data)))
-            if not ends and all(line.arrivals for line in lines.values()):
-                latest_s, ends = time.monotonic() + LISTEN_S, True
+        _read(selector, FIRST_LINE_S, lambda: all(line.arrivals for line in ports))
+        if all(line.arrivals for line in ports):
+            _read(selector, LISTEN_S, lambda: False)
+            _read(selector, LONGER_S, lambda: all(line.data.count(b"\n") > ENOUGH_LINES for line in ports))
+
+
+def _read(selector: selectors.BaseSelector, most_s: float, enough: Callable[[], bool]) -> None:
+    """Read what arrives until it is `enough`, `most_s` at most. A port that fails or sends too much is left out."""
+    latest_s = time.monotonic() + most_s
+    while not enough() and (now_s := time.monotonic()) < latest_s and selector.get_map():
+        for key, _ in selector.select(latest_s - now_s):
+            line = key.data
+            data = b""
+            with contextlib.suppress(*LOST):
+                data = line.port.read(READ_BYTES)
+            if not data or len(line.data) > MOST_BYTES:
+                selector.unregister(key.fileobj)
+                continue
+            line.data += with_newlines(data)
+            line.arrivals.append((time.monotonic(), len(line.data)))
 
 
 def _understood(line: _PortBytes, baud_rate: int) -> PortLines | str:

@@ -24,8 +24,8 @@ ACCESSES, MORE_ACCESSES = 4, 12  # of `what_another_program`
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """`make test-quick` has two kinds of adapter and few accesses of other programs, `make test` the others for one
     chip, `make test-all` more accesses, and `make nightly` one more kind for each chip."""
-    chips = [item for item in items if isinstance(item, pytest.Function)]
-    chips = [item for item in chips if issubclass(item.cls or object, I2cContract)]
+    methods = [item for item in items if isinstance(item.parent, pytest.Class) and isinstance(item, pytest.Function)]
+    chips = [item for item in methods if issubclass(item.cls or object, I2cContract)]
     others: defaultdict[str, list[str]] = defaultdict(list)
     for item in chips:
         if (adapter := item.callspec.params["adapter"]) not in FOR_EACH_CHIP:

@@ -201,16 +201,16 @@ def q_drifts(draw: Drawn) -> World:
 
 @case
 def the_drift_of_q_walks(draw: Drawn) -> World:
-    """Day by day: the rate of each day moves Q on this day. Two windows told the rate of the beginning."""
-    u, days, walk, most = (0.01, 0.5), 100, 2e-5, 1e-3
+    """Day by day: the mean rate of each day moves Q on this day. Two windows told the rate of the beginning."""
+    u, days, walk, most = (0.01, 0.5), 20, 1e-4, 1e-3
     S, Q = s_and_q(draw, u)
     rate = SCALE * most * draw("rate")
     records = [told(BESIDE, Truth(S, Q), 0.0), told(BESIDE, Truth(S, Q + 1.0 * rate), 1.0)]
     kept = np.exp(-0.5 * walk**2 / most**2)
     moved, later = draw("walk", 3 * days).reshape(days, 3), Q + rate
     for each_day in moved:
-        later = later + rate
-        rate = kept * rate + SCALE * most * np.sqrt(1.0 - kept**2) * each_day
+        before, rate = rate, kept * rate + SCALE * most * np.sqrt(1.0 - kept**2) * each_day
+        later = later + 0.5 * (before + rate)
     walks = {"offset_rate_mps2": most, "offset_rate_walk_mps2": walk}
     return World("walk", each(*OFFSET), records, values(S, later), u, {}, walks, until=1.0 + days)
 
@@ -316,9 +316,10 @@ def a_reference_drifts_between_windows(draw: Drawn) -> World:
     """S may have walked by any amount meanwhile, so that the second window alone tells it."""
     u = 0.5, 0.01
     S, Q = s_and_q(draw, u)
-    later = walked(draw, "walk", S, S0, SCALE * 0.5, SCALE * 0.01, 730.5)
-    drift = 0.005 * np.sqrt(2.0) * draw("drift")
-    records = [told(LEVEL, Truth(S, Q), 0.0), told(LEVEL, Truth(later, Q, reference=drift), 730.5)]
+    days = 7.305
+    later = walked(draw, "walk", S, S0, SCALE * 0.5, SCALE * 0.01, days)
+    drift = 0.005 * np.sqrt(days / 365.25) * draw("drift")
+    records = [told(LEVEL, Truth(S, Q), 0.0), told(LEVEL, Truth(later, Q, reference=drift), days)]
     more = {"certified": {"A": 0.0}}
     return World(
         "drift", each(*MAIN), records, values(later, Q), u, {"reference_drift": 0.005}, {"sensitivity": 0.01}, more=more
@@ -626,10 +627,13 @@ def noise_of_means_that_were_merged(draw: Drawn) -> World:
 
 @case
 def a_walk_within_windows_that_were_merged(draw: Drawn) -> World:
-    """Their mean differs from S and Q in the middle of their time, to which they are ascribed."""
-    u, count = (0.5, 50.0), 40
+    """Their mean differs from S and Q in the middle of their time, to which they are ascribed.
+
+    The steps between `count` windows are so large that their mean walks as that of many windows.
+    """
+    u, count = (0.5, 50.0), 20
     S, Q = s_and_q(draw, u)
-    steps = draw("walk", 2 * count).reshape(2, count) * np.array([[1e-4], [0.1]]) * SCALE * np.sqrt(10.0 / (count - 1))
+    steps = draw("walk", 2 * count).reshape(2, count) * np.array([[1e-4], [0.1]]) * SCALE * np.sqrt(10.0 / count)
     steps[:, [0, -1]] *= np.sqrt(0.5)  # from the middle to the windows on both sides
     half = count // 2
     path = np.hstack([np.cumsum(steps[:, :half], axis=1)[:, ::-1], np.cumsum(steps[:, half:][:, ::-1], axis=1)])
@@ -644,9 +648,9 @@ def a_walk_within_windows_that_were_merged(draw: Drawn) -> World:
 @case
 def a_reference_that_drifts_within_windows_that_were_merged(draw: Drawn) -> World:
     """S is known, so that they tell the drift in the middle of their time, but for what it walked before and after."""
-    u, count, days = (1e-6, 0.01), 40, 100.0
+    u, count, days = (1e-6, 0.01), 20, 100.0
     S, Q = s_and_q(draw, u)
-    steps = draw("walk", 2 * count).reshape(2, count) * 0.005 * np.sqrt(days / 365.25 / (count - 1))
+    steps = draw("walk", 2 * count).reshape(2, count) * 0.005 * np.sqrt(days / 365.25 / count)
     steps[:, [0, -1]] *= np.sqrt(0.5)
     half = count // 2
     path = np.hstack([np.cumsum(steps[:, :half], axis=1)[:, ::-1], np.cumsum(steps[:, half:][:, ::-1], axis=1)])

@@ -96,7 +96,8 @@ def test_unplugged_and_back_it_goes_on(tmp_path: Path, port: PtyDevice) -> None:
     assert agent.returncode == 0
     assert "Traceback" not in output.read_text()
     changes = [event.state for event in events(data_dir) if isinstance(event, DeviceChange)]
-    assert changes[-4:] == ["lost", "open", "lost", "open"]
+    turns = [state for state, _ in itertools.groupby(changes)]  # lost again, where it could not be opened meanwhile
+    assert turns[-4:] == ["lost", "open", "lost", "open"]
 
 
 @pytest.mark.thorough

@@ -62,8 +62,8 @@ def test_the_page_shows_what_the_terminal_says(site: Site, tmp_path: Path, brows
             if "does not look like" in told:
                 warned = WARNED.findall("".join(asked))
                 texts = page.locator("#bench-warnings li").all_inner_texts()
-                assert [re.sub(r"^Stop [12]: ", "", text) for text in texts] == warned
-                assert texts[-1].startswith("Stop 2: ")
+                assert [re.sub(r"^Stop [12]: ", "", text) for text in texts] == warned[::-1]  # the newest first
+                assert texts[0].startswith("Stop 2: ")
                 assert axe_faults(page) == []
             if (taken := re.search(r"stop 1, (.*): U is now", told)) is not None:  # the page told U in each second
                 stay = re.compile(rf"At {taken[1]}[2-9] s of 4 to 60 s; U will be \d")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -94,6 +95,18 @@ def test_a_sensitivity_far_from_nominal_is_refused_with_the_numbers():
     found = adjust(clamp_points(np.random.default_rng(8), ORDINARY).windows, _nominal(size=2.0, u=0.1))
     assert "contradict" in _only_reason(found)
     assert "2 with u 0.2 was expected" in _only_reason(found)
+
+
+@pytest.mark.parametrize("wrong", [0.1, -0.1])
+def test_a_contradiction_of_the_prior_has_the_square_of_the_deviation(wrong):
+    """S is known to 0.01 of each element, and one of them is 10 u off: chi-squared is 100, whichever the sign."""
+    windows = clamp_points(np.random.default_rng(9), Faults(noise_mps2=0.001)).windows
+    stated = np.append(S_TRUE.ravel(), np.zeros(3)) + wrong * np.eye(12)[4]
+    covariance = np.diag([1e-4] * 9 + [np.inf] * 3)
+    reason = _only_reason(adjust(windows, replace(Priors.none(), parameters=stated, covariance=covariance)))
+    told = re.search(r"chi-squared ([0-9.]+), .*; (\w+) is .* with u ([0-9.]+) was expected", reason)
+    assert told is not None, reason
+    assert (float(told[1]), told[2], told[3]) == (pytest.approx(100.0, rel=0.02), "Syy", "0.01")
 
 
 def test_what_the_prior_says_better_than_the_data_is_not_determined_by_them():

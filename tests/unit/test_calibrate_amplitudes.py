@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import calib
 from agent.cli.main import run_cli
 from agent.cli.simulate import write_files
 from hw.virtual.bench import Bench
@@ -120,3 +121,16 @@ def test_an_earlier_result_is_a_prior(tmp_path: Path, capsys: pytest.CaptureFixt
     status, found, said = run(tmp_path, capsys, 1, "--prior", str(prior))
     assert (status, len(found["reasons"])) == (3, 1)
     assert "Syy is" in said
+
+
+def test_an_axis_that_shows_much_of_another_is_refused_unless_s_was_stated() -> None:
+    t = np.arange(9000) / 200.0
+    a = 3.0 * np.sin(2.0 * np.pi * 3.0 * t)
+    poses = [{"start_s": 15.0 * k, "stop_s": 15.0 * k + 14.0, "axis": axis} for k, axis in enumerate("xyz")]
+    along = a[:, None] * np.eye(3)[np.minimum(t // 15.0, 2.0).astype(int)]
+    V = along @ np.array([[1.0, 0.4, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]).T
+    V += np.random.default_rng(1).normal(0.0, 1e-4, V.shape)
+    (turned,) = calib.calibrate((t, V), (t, a), poses=poses, method=1).reasons
+    assert turned.startswith("Sxy is 40% of the largest sensitivity of row x")
+    (stated,) = calib.calibrate((t, V), (t, a), poses=poses, method=1, nominal=1.0, u_nominal_pct=1.0).reasons
+    assert stated.startswith("Sxy is 0.4, ")

@@ -56,6 +56,13 @@ def test_noise_that_comes_with_the_motion_is_no_other_response(seed: int) -> Non
     assert found.between.scatter == 0.0
 
 
+def test_rows_weigh_less_only_where_they_scatter_more_than_their_noise() -> None:
+    """In one of 100 cases noise alone shows 1.2 times the quantile of chi-squared, which is 37.6 for 20 rows."""
+    assert Deviations().times_noise == 1.0
+    assert Deviations(freedom=20.0, square=45.0).times_noise == 1.0
+    assert Deviations(freedom=20.0, square=46.0).times_noise == 2.3
+
+
 def test_a_narrow_feature_of_the_response_is_found_in_this_noise() -> None:
     found = together(4, 1, narrow=0.05).between
     assert 4.0 < found.at_hz < 5.1

@@ -141,6 +141,16 @@ def test_columns_that_cannot_be_told_apart_are_asked(
     assert not path.exists()
 
 
+def test_where_few_lines_came_it_listens_until_a_counter_has_begun_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A slow device, or a busy machine: a counter to 50 looks like a sample counter for half a second."""
+    monkeypatch.setattr("agent.setup.listening.LISTEN_S", 0.1)
+    with writing(lambda k: f"{k % 50},{REST}\n") as port:
+        assert init(tmp_path / "gateway.toml", port) == 2
+    assert "what the 4 columns of its lines are" in capsys.readouterr().err
+
+
 def test_a_device_with_one_axis_is_no_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with writing(lambda k: f"{k},0.0{k % 7}\n") as port:
         assert init(tmp_path / "gateway.toml", port) == 2

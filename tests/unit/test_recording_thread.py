@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.core.events import Result
+from agent.core.events import Pruned, Result
 from agent.recording.reading import RecordingReader
 from agent.recording.thread import RecordingThread
 from agent.recording.writer import Recorder
@@ -79,6 +79,22 @@ def test_rotation_is_not_wanted_while_a_run_start_is_on_its_way(tmp_path: Path) 
     assert not thread.wants_rotation
     go_on.set()
     wait_for(lambda: thread.wants_rotation)
+    thread.close()
+
+
+def test_a_deletion_is_due_once_until_it_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    due = Pruned(t_monotonic_ns=0, t_utc_ns=0, first_file=1, last_file=1, last_sha256="00" * 32, bytes=10)
+    recorder = Recorder(tmp_path, [], [])
+    recorder.pruning = due
+    monkeypatch.setattr(recorder, "look_for_pruning", lambda: None)
+    monkeypatch.setattr(recorder, "record", lambda *_: go_on.wait(PATIENCE_S))
+    thread = RecordingThread(recorder, lambda *_: None)
+    assert thread.take_pruning() == due
+    thread.put(1, due, [])
+    assert thread.take_pruning() is None
+    go_on.set()
+    wait_for(lambda: thread.take_pruning() == due)  # the next one
     thread.close()
 
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from agent.report import tables, timelines
+from agent.report import diagrams, tables, timelines
 from agent.report.frequencies import over_frequency, response
 from agent.report.material import window_verdict
 from agent.report.result import CalibrationResult, ResultError, from_update, parse
@@ -39,6 +39,13 @@ def fields(**changes: Any) -> dict[str, Any]:
 
 def result(**changes: Any) -> CalibrationResult:
     return parse(fields(**changes), "name")
+
+
+def test_each_result_stands_once_in_the_legend() -> None:
+    drawn = diagrams.transverse_sensitivities([result(method="1"), result(method="3")])
+    assert drawn is not None
+    (legend,) = drawn.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["Method 1", "Method 3"]
 
 
 def test_a_result_is_read_in_the_order_of_the_parameters() -> None:

@@ -11,7 +11,9 @@ import pytest
 from agent.config import Config
 from agent.core.events import Acceleration, Event, Result, WatchReport
 from agent.core.pipeline import Pipeline
+from agent.core.watch import SensorWatch
 from agent.recording.messages import decode, encode, schema_of, topic_of
+from calib.estimate.correction import Law
 from calib.model import scale_of
 from calib.signal.spectra import bands_of
 from hw.block import BlockFlags, SampleBlock
@@ -187,6 +189,17 @@ def test_an_hour_tells_mean_noise_power_and_temperature() -> None:
     cross = np.mean([np.reshape(r.cross_power, (3, -1)) for r in whole], axis=0)
     assert np.abs(cross[:, 5:] / (2.5e-5 * width_hz / 5.0)[5:]).max() < 0.15
     assert whole[0].band_hz == bands.centre_hz.tolist()
+
+
+def test_the_hour_of_a_fast_device_lasts_an_hour() -> None:
+    """A rate one per cent above the nominal one makes more samples, and no longer hour."""
+    world, watch = World(), SensorWatch()
+    law = Law(np.append(S_TRUE.ravel(), np.zeros(3)), np.eye(12))
+    begin_ns = EPOCH_NS // HOUR_NS * HOUR_NS + HOUR_NS
+    ends_s = 40.0 + 39.6 * np.arange(92)
+    made = [replace(world.block(40.0), t_utc_ns=begin_ns + round(end_s * SECOND)) for end_s in ends_s.tolist()]
+    [hour] = [told for block in made if (told := watch.update(block, np.zeros(3, dtype=bool), law))]
+    assert (hour.counts["samples"], hour.duration_s) == (36400, 3600.0)
 
 
 @pytest.mark.slow
