@@ -15,7 +15,7 @@ from calib.model import Array
 from calib.site_watch.day import Day, SelfTests, Visits
 from calib.site_watch.scatter import LAGS_DAYS, Blocks
 from calib.site_watch.steps import HUBER, PRIOR_DEGREES, TERMS, Steps
-from calib.site_watch.together import DIRECTIONS, biweight, design, scores
+from calib.site_watch.together import DIRECTIONS, biweight, design, median, scores
 from calib.site_watch.witnesses import supply_basis
 
 ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
@@ -283,9 +283,7 @@ def pooled(left: Array, freedom: Array, shape: tuple[int, ...]) -> Array:
     """Variance of each channel from its own days, drawn to the median of all sensors as by PRIOR_DEGREES days."""
     left, freedom = left.reshape(shape), freedom.reshape(shape)
     own = np.where(freedom >= FEWEST_LEFT, left / np.maximum(freedom, 1.0), np.nan)
-    middle = np.ones(shape[1:])
-    known = np.isfinite(own).any(axis=0)
-    middle[known] = np.nanmedian(own[:, known], axis=0)
+    middle = np.where(np.isfinite(own).any(axis=0), median(own, axis=0), 1.0)
     return np.asarray((left + PRIOR_DEGREES * middle) / (freedom + PRIOR_DEGREES))
 
 
@@ -293,10 +291,7 @@ def _common(residual: Array, information: Array) -> Array:
     """What all sensors share in a band and axis on this day (B, 3): a median, then Tukey's biweight."""
     there = information > 0.0
     enough = there.sum(axis=0) >= FEWEST_SENSORS
-    common = np.zeros(enough.shape)
-    if not enough.any():
-        return common
-    common[enough] = np.nanmedian(np.where(there, residual, np.nan)[:, enough], axis=0)
+    common = np.where(enough, median(np.where(there, residual, np.nan), axis=0), 0.0)
     for _ in range(2):
         weight = information * biweight((residual - common) * np.sqrt(information))
         total = weight.sum(axis=0)
