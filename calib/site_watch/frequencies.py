@@ -26,6 +26,7 @@ PART_UNSEEN = 1.0  # the same as a part of the scatter of a day: where modes sha
 # Part of the scatter between sensors that enters the test; all of it enters U. Sensors that see other modes in the
 # window too show a smaller change, so that they differ where the change is true.
 PART_APART = 0.5
+LEAST_VARIANCE = 1e-12  # of a channel over U_FREQUENCY², where its days do not scatter at all
 WALK_PER_ROOT_DAY = 5e-5  # standard uncertainty of its own walk after a day: 0.1 % in a year
 FEWEST_SENSORS = 3  # that must see the mode
 FARTHEST = 0.55  # third octaves from the centre of its window: beyond it a mode stands nearer to that of the next one
@@ -80,7 +81,7 @@ def joined(watch: SiteWatch, which: list[int], fewest: tuple[int, int], longest_
     counts = (since >= fewest[1]) & (days - since >= fewest[0]) & (np.abs(place) < 1.0)
     variance = pooled(*steps.rest(), shape)
     explained = size**2 * information / (np.maximum(days, 1.0) + PRIOR_DEGREES)  # a step is no scatter
-    variance = np.maximum(variance - explained, 0.2 * variance)
+    variance = np.maximum(np.maximum(variance - explained, 0.2 * variance), LEAST_VARIANCE)
     information = np.where(counts, information / variance, 0.0)
     begins = [steps.begins[k] for k in which]
     ages = np.array([watch.day - begin + 1 for begin in begins], dtype=float)
@@ -89,7 +90,7 @@ def joined(watch: SiteWatch, which: list[int], fewest: tuple[int, int], longest_
     inflation = MISFIT**2 * watch.frequency_scatter.over(watch.day, begins).reshape(-1, *shape[1:])
     common = walked[:, None, None] + inflation * _inverse(information.sum(axis=1))
     part = np.clip((0.5 * PARTS * (place + 1.0)).astype(np.int64), 0, PARTS - 1)
-    exact = np.where(counts, 1.0 / (U_FREQUENCY**2 * np.maximum(variance, 1e-12)), 0.0)
+    exact = np.where(counts, 1.0 / (U_FREQUENCY**2 * variance), 0.0)
     found = [_group(size, np.where(part == q, information, 0.0), exact, common) for q in range(PARTS)]
     told, u, statistic = (np.stack(each, axis=-1) for each in zip(*found, strict=True))
     return Joined(told, u, statistic, information, size, part, *_contrasts(watch, which, fewest))

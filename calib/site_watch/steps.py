@@ -47,7 +47,8 @@ class Steps:
 
     def expected(self, x: Array) -> tuple[Array, Array]:
         """Expected value of each channel on a day with regressors `x` (TERMS, C), and u² of it over the variance."""
-        return np.einsum("pc,pc->c", x, self.beta), np.einsum("pc,pqc,qc->c", x, self.inverse, x, optimize=True)
+        moved = np.einsum("pqc,qc->pc", self.inverse, x)
+        return np.einsum("pc,pc->c", x, self.beta), np.einsum("pc,pc->c", x, moved)
 
     def update(self, day: int, x: Array, y: Array, weight: Array) -> None:
         """Take a day; `weight` (C,) is 0 where a channel does not count. Days must come in order."""
@@ -56,9 +57,10 @@ class Steps:
         self._thin(day)
         there = weight > 0.0
         y = np.where(there, y, 0.0)
-        wx = weight * np.where(there, x, 0.0)
+        x = np.where(there, x, 0.0)
+        wx = weight * x
         for p in range(TERMS):
-            self.A[p] += wx[p] * np.where(there, x, 0.0)
+            self.A[p] += wx[p] * x
         self.b += wx * y
         self.squares += weight * y * y
         self.days += there
@@ -109,7 +111,7 @@ class Steps:
     def _solve(self) -> None:
         ridge = self.prior_scale / PRIOR**2
         self.inverse = inverted(self.A + np.diag(ridge)[:, :, None])
-        self.beta = np.einsum("pqc,qc->pc", self.inverse, self.b, optimize=True)
+        self.beta = np.einsum("pqc,qc->pc", self.inverse, self.b)
 
     def _thin(self, day: int) -> None:
         """Leave out each begin whose neighbours are closer than their age allows."""

@@ -15,7 +15,7 @@ from calib.model import Array
 from calib.site_watch.day import Day, SelfTests, Visits
 from calib.site_watch.scatter import LAGS_DAYS, Blocks
 from calib.site_watch.steps import HUBER, PRIOR_DEGREES, TERMS, Steps
-from calib.site_watch.together import DIRECTIONS, biweight, design, scores
+from calib.site_watch.together import DIRECTIONS, biweight, design, median, scores
 from calib.site_watch.witnesses import supply_basis
 
 ORIGIN_DEGC, SCALE_K = 10.0, 10.0  # of the temperature in the norm
@@ -28,6 +28,7 @@ MEMORY_DAYS = 60.0  # of the scatter of days: frost, traffic and wind make it an
 PRIOR_BLOCKS = 30.0  # by which a sensor's own scatter of days is drawn to that of all: its test has no wide tails
 FEWEST_SENSORS = 2  # with a band, for its common level to be taken out; of two it is their mean
 CHANNELS = 6
+LEVELS = slice(3, TERMS)  # of the regressors: the levels of the band and of the site
 WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
 U_SELF_TEST = 0.001  # of the log of a response, however little it scatters; only ratios of weights depend on it
 U_FREQUENCY = 0.001  # of the peak frequency of a day; only ratios of weights, and the prior, depend on it
@@ -109,7 +110,9 @@ class SiteWatch:
         self._follow(self.means, self.mean_scatter, np.broadcast_to(mean, u_mean.shape), u_mean, degc)
         contrast = np.full(u_mean.shape, np.nan) if day.contrast is None else day.contrast
         contrast = np.where(visited[:, None], np.nan, contrast)
-        self._follow(self.contrasts, self.contrast_scatter, contrast, np.full(u_mean.shape, U_BAND), degc, squared=True)
+        levels = x.reshape(TERMS, *self.shape)[LEVELS, ..., :3].mean(axis=2)
+        u_contrast = np.full(u_mean.shape, U_BAND)
+        self._follow(self.contrasts, self.contrast_scatter, contrast, u_contrast, degc, squared=True, levels=levels)
         self._take_self_tests(day, visited)
         self._take_frequencies(day, x)
         self._seen(there.sum(axis=(1, 2)) > 0)
@@ -230,16 +233,27 @@ class SiteWatch:
         self._follow(self.frequency_contrasts, None, contrast, np.full(shape, U_FREQUENCY), degc, squared=True)
 
     def _follow(
-        self, steps: Steps, scatter: Blocks | None, told: Array, u: Array, degc: Array, *, squared: bool = False
+        self,
+        steps: Steps,
+        scatter: Blocks | None,
+        told: Array,
+        u: Array,
+        degc: Array,
+        *,
+        squared: bool = False,
+        levels: Array | None = None,
     ) -> None:
-        """Noise floors, means, responses and contrasts `told` (n, ...) are followed as the channels are, without a
-        level; `u` (n, ...): of one of them; `degc` (n,). `squared`: the norm has the square of the temperature too."""
+        """Noise floors, means, responses and contrasts `told` (n, ...) are followed as the channels are; `u` (n, ...):
+        of one of them; `degc` (n,). `squared`: the norm has the square of the temperature too. `levels` (2, n, ...):
+        the last two regressors, where the norm has them."""
         value = told.ravel()
         there = np.isfinite(value)
         x = np.zeros((TERMS, len(value)))
         x[0] = 1.0
         x[1] = np.repeat(np.nan_to_num((degc - ORIGIN_DEGC) / SCALE_K), len(value) // len(degc))
         x[2] = x[1] ** 2 if squared else 0.0
+        if levels is not None:
+            x[LEVELS] = levels.reshape(2, -1)
         u2_told = np.where(there, np.square(u.ravel()), 1.0)
         expected, u2 = steps.expected(x)
         s2 = pooled(*steps.rest(), told.shape).ravel()
@@ -269,9 +283,7 @@ def pooled(left: Array, freedom: Array, shape: tuple[int, ...]) -> Array:
     """Variance of each channel from its own days, drawn to the median of all sensors as by PRIOR_DEGREES days."""
     left, freedom = left.reshape(shape), freedom.reshape(shape)
     own = np.where(freedom >= FEWEST_LEFT, left / np.maximum(freedom, 1.0), np.nan)
-    middle = np.ones(shape[1:])
-    known = np.isfinite(own).any(axis=0)
-    middle[known] = np.nanmedian(own[:, known], axis=0)
+    middle = np.where(np.isfinite(own).any(axis=0), median(own, axis=0), 1.0)
     return np.asarray((left + PRIOR_DEGREES * middle) / (freedom + PRIOR_DEGREES))
 
 
@@ -279,10 +291,7 @@ def _common(residual: Array, information: Array) -> Array:
     """What all sensors share in a band and axis on this day (B, 3): a median, then Tukey's biweight."""
     there = information > 0.0
     enough = there.sum(axis=0) >= FEWEST_SENSORS
-    common = np.zeros(enough.shape)
-    if not enough.any():
-        return common
-    common[enough] = np.nanmedian(np.where(there, residual, np.nan)[:, enough], axis=0)
+    common = np.where(enough, median(np.where(there, residual, np.nan), axis=0), 0.0)
     for _ in range(2):
         weight = information * biweight((residual - common) * np.sqrt(information))
         total = weight.sum(axis=0)

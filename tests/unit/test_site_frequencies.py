@@ -16,7 +16,7 @@ from calib.site_watch.day import FEWEST_HOURS, Hours, Visits, day_of
 from calib.site_watch.frequencies import moved_bands
 from calib.site_watch.together import DIRECTIONS, JointChange
 from calib.site_watch.verdicts import SiteVerdicts, _means, result
-from calib.site_watch.watch import SiteWatch
+from calib.site_watch.watch import SiteWatch, pooled
 
 BANDS_HZ = 10.0 ** (np.arange(0, 6) / 10.0)
 N, BEGAN, CHANGED = 6, 20_000, 20_050
@@ -117,6 +117,18 @@ def test_sound_frequencies_follow_the_temperature_and_are_not_told() -> None:
 
 
 @pytest.mark.slow
+def test_frequencies_that_do_not_scatter_at_all_are_not_told() -> None:
+    """As of days that were copied: their variance is 0."""
+    hours, watch = Frequencies(1).day()[0], SiteWatch(GATEWAY, BANDS_HZ)
+    for k in range(60):
+        watch.update(
+            replace(day_of(replace(hours, frequency=np.zeros_like(hours.frequency)), BANDS_HZ), number=BEGAN + k)
+        )
+    assert (pooled(*watch.frequencies.rest(), (N, len(BANDS_HZ), 3)) == 0.0).all()
+    with np.errstate(divide="raise", invalid="raise"):
+        assert not result(watch).frequencies
+
+
 def test_what_one_sensor_sees_alone_is_not_the_structure() -> None:
     assert not after(20, in_window(2, 0.05, slice(0, 1))).frequencies
     assert not after(20, in_window(2, 0.05, slice(0, 2))).frequencies

@@ -605,6 +605,23 @@ def test_the_contrast_of_a_day_is_that_of_its_quiet_hours(lived: tuple[SiteWatch
     assert np.abs(np.delete(day - sound, 4, axis=0)).max() < 3e-3, "the level of each hour is a median"
 
 
+@pytest.mark.parametrize(("by_night", "told"), [(0.0, "sensitivity"), (0.02, "excitation")])
+def test_a_contrast_that_grows_with_the_level_of_the_site_is_learnt(by_night: float, told: str) -> None:
+    """Sensor 4 loses 1 % when a season of less excitation begins, and its quiet hours differ more in it, as they always
+    did on such days. What they differ by in addition is the excitation."""
+    site, random = Site(1), np.random.default_rng(14)
+    watch, grown = SiteWatch(site.gateway, BANDS_HZ), random.uniform(-0.03, 0.03, (9, 3))
+    grown[4], change, shown = (0.03, -0.02, 0.03), np.zeros((9, 6)), np.zeros((9, 3))
+    for k in range(70):
+        if k == 60:
+            change[4, :3], shown[4] = -0.01, by_night
+        day = site.day(change)
+        level = day.level - (1.0 if k >= 60 else 0.0)
+        contrast = grown * level.mean() + shown + random.normal(0, 0.003, (9, 3))
+        watch.update(replace(day, level=level, contrast=contrast))
+    assert kinds(result(watch)) == {4: told}
+
+
 @pytest.mark.thorough
 def test_a_gateway_whose_clock_is_an_hour_off_is_told_as_its_clock() -> None:
     """For 12 days, then its clock is set: nothing else is told of it, and nothing of the others."""
