@@ -70,8 +70,9 @@ def clock_bend(sensor: Samples, reference: Samples, points: Points, independent:
     `independent` is the share of them that are.
     """
     n, m = len(points.time_s), own_channels(points.u.shape[1])
-    if any(len(one.clock.knot_index) != 2 for one in (sensor, reference)) or n < SEGMENTS * FEWEST_POINTS:
-        return None  # the clock of a long file is not one parabola
+    one_parabola = all(len(one.clock.knot_index) == 2 for one in (sensor, reference))  # as of no long file
+    if not one_parabola or n < SEGMENTS * FEWEST_POINTS or not (np.diff(points.time_s) > 0.0).all():
+        return None
     u_end_s = float(np.hypot(sensor.clock.u_offset_s, reference.clock.u_offset_s))
     moved, rate = (float(np.linalg.norm(one[:, :m] - one[:, :m].mean(axis=0))) for one in (points.u, points.du))
     if not rate * u_end_s > LEAST_RAD * moved:

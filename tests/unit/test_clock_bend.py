@@ -124,6 +124,29 @@ def test_a_file_whose_clock_has_several_pieces_is_left_alone() -> None:
     assert clock_bend(*devices(U_END_S, knots=4), points(5, np.array([1e-3, 0.0])), 0.32) is None
 
 
+@pytest.mark.parametrize("unit", [1e19, 1e-12])
+def test_the_unit_of_the_outputs_does_not_matter(unit: float) -> None:
+    """1e19 is the largest number that a file may hold."""
+    of = points(6, np.array([1e-3, -1e-3]))
+    found, scaled = bend_of(of), bend_of(of._replace(V=unit * of.V))
+    assert found is not None
+    assert scaled is not None
+    np.testing.assert_allclose(scaled.bend_s, found.bend_s, rtol=1e-6)
+    np.testing.assert_allclose(scaled.root, found.root, rtol=1e-6)
+
+
+def test_outputs_without_noise_are_no_fault() -> None:
+    of = points(6, np.zeros(2))
+    found = bend_of(of._replace(V=of.u @ S.T))
+    assert found is not None
+    assert np.abs(found.bend_s).max() < 1e-9
+
+
+def test_times_that_go_back_are_left_alone() -> None:
+    of = points(6, np.zeros(2))
+    assert bend_of(of._replace(time_s=of.time_s[::-1].copy())) is None
+
+
 def test_outputs_that_show_nothing_tell_nothing() -> None:
     """Of a sensor that is dead or stuck, all stays open, and no slope depends on it."""
     found = bend_of(points(6, np.zeros(2))._replace(V=np.zeros((len(TIME_S), 3))))
