@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -31,7 +32,11 @@ from tests.unit.test_certificate_stating import entries
 THROUGH_S = 100.0  # four positions take 52 s; where a busy machine lost samples, one round more
 ROTATE_S = 11
 ABSENCE = absence()
-STATED = [f"--state={name}={value}" for name, value in entries().items() if not name.startswith("decision")]
+TODAY = datetime.now(UTC).date().isoformat()
+DATES = {f"dates.{name}": TODAY for name in ("begun", "ended", "issued")}
+STATED = [
+    f"--state={name}={DATES.get(name, value)}" for name, value in entries().items() if not name.startswith("decision")
+]
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,7 @@ def record_events(
     pipeline = Pipeline.begin(config, run_id, 0, 0, {})
     devices, sensors = [d.name for d in config.devices], [c.sensor for c in config.channels]
     store = Store(data_dir, 0)
+    store.mark_file(1)
     recorder = Recorder(data_dir, devices, sensors, signer=signer, epoch=store.epoch)
     start = RunStart(
         run_id=run_id, site=config.gateway.site, gateway=config.gateway.name, boot_id="boot", t_monotonic_ns=0,
