@@ -83,9 +83,8 @@ def clock_bend(sensor: Samples, reference: Samples, points: Points, independent:
     if not rate * u_end_s > LEAST_RAD * moved:
         return None
     unit_s, mean_s = OF_END * u_end_s, 0.0
-    found = ClockBend(
-        (float(points.time_s[0]), float(points.time_s[-1])), np.zeros(2), np.diag(unit_s), np.zeros((m, 3))
-    )
+    begun_s, ended_s = sensor.clock.knot_time_s.tolist()
+    found = ClockBend((begun_s, ended_s), np.zeros(2), np.diag(unit_s), np.zeros((m, 3)))
     second = np.gradient(points.du, points.time_s, axis=0)
     for _ in range(TURNS):
         at_s = points.time_s - found.at(points.time_s) - mean_s

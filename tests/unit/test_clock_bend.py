@@ -91,6 +91,20 @@ def test_times_are_corrected_by_the_bend() -> None:
     assert abs(moved_s.mean()) < 1e-6
 
 
+def test_a_stretch_within_the_time_of_its_clock() -> None:
+    """The bend is that of the clock, whatever part of its time the points are of: taken out of the sensor's times, it
+    brings them to where they were taken, but for the mean and for what stays open."""
+    bend_s = np.array([1.2e-3, -0.9e-3])
+    of = points(1, bend_s).part(3000, 12000)
+    found = bend_of(of)
+    assert found is not None
+    sensor, _ = devices(U_END_S)
+    left_s = found.taken_out(sensor).time_s - sensor.time_s + replace(found, bend_s=bend_s).at(TIME_S)
+    within_s = left_s[3000:12000]
+    assert np.ptp(within_s) < 0.2 * np.ptp(replace(found, bend_s=bend_s).at(of.time_s))
+    np.testing.assert_allclose(found.at(TIME_S), sensor.time_s - found.taken_out(sensor).time_s, atol=1e-9)
+
+
 def test_what_is_left_open_moves_the_slopes_so_much() -> None:
     """The slopes on u and du/dt of a window with a bend more or less differ by what `left_in` says."""
     of, step_s = points(2, np.zeros(2)), 1e-5
