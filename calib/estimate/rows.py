@@ -257,7 +257,7 @@ class _Slopes:
         u_lag_s = [max(p.lag_window_s, r.u_lag_s) * (p.lag_s > 0.0) for p, r in zip(priors, records, strict=True)]
         u = np.array([u_lag_s, [r.attenuation for r in records]]).T / np.sqrt(merged)[:, None]
         self._loaded = np.array([r.loadings for r in records]).mT * u[:, None]
-        self._bent = np.array([r.by_bend for r in records]).mT / np.sqrt(merged)[:, None, None]
+        self._bent = _alike([r.by_bend for r in records]).mT / np.sqrt(merged)[:, None, None]
         self._white = _white([own.slopes for own in noise], records)
         # What nobody knows of S along directions that were not excited, by the little that moved there.
         unknown = np.minimum(s.u[:9], FLAT * s.scale).reshape(3, 3)
@@ -301,6 +301,14 @@ class _Slopes:
             shares[BESIDE] = ((self._beside.mT @ moved) ** 2).sum(axis=(0, 1))
         by_spread = ((self._spread.mT @ moved) ** 2).sum(axis=(0, 1))
         return shares | ({TEMPERATURE: by_spread} if self._spread.size else {})
+
+
+def _alike(rows: Sequence[Array]) -> Array:
+    """(W, k, n) rows (at most k, n) of each of W windows, with rows of zeros behind."""
+    found = np.zeros((len(rows), max(map(len, rows), default=0), rows[0].shape[1] if rows else 0))
+    for own, told in zip(found, rows, strict=True):
+        own[: len(told)] = told
+    return found
 
 
 def _beside_one_axis(windows: Windows, s: Statements, u: Array) -> Array:

@@ -2,8 +2,9 @@
 
 A clock is a parabola below the arrivals of a minute (calib.signal.timing). Arrivals that scatter leave not only its
 offset open, but its slope and its curvature too: 30 ms of scatter in the reads leave 3 ms between the middle and the
-ends of a minute. In a motion that stays the same all the time, a lag that changes looks like noise. Where blows of
-several frequencies and directions come one after the other, it looks like another S.
+ends of a minute. In a motion that stays the same all the time, a lag that changes looks like noise, and makes slopes
+smaller in second order. Where blows of several frequencies and directions come one after the other, it looks like
+another S.
 """
 
 from __future__ import annotations
@@ -22,9 +23,6 @@ from calib.signal.samples import Samples
 OF_END = np.sqrt([3.0, 5.0]) / 3.0
 WITHIN_U = 4.0  # of what the clocks leave open: what is further away is something else
 LEAST_RAD = 3e-3  # of phase that the clocks leave open: less changes S by less than 1e-5
-# Of what a bend moves, the part that looks like motion. With less, as in all motion that stays the same, it looks like
-# noise, and for it no u of a slope would be larger by 7 %.
-LIKE_MOTION = 0.125
 TURNS = 3  # each one leaves some per cent of the bend
 SEGMENTS, FEWEST_POINTS = 32, 20  # of a stretch, whose scatter is that of the result, and points in each
 # Of the covariance: blows are few, and the residuals of one are alike. 60 drawn bends scatter by 1.4, in variance, and
@@ -68,8 +66,8 @@ class ClockBend:
 
 
 def clock_bend(sensor: Samples, reference: Samples, points: Points, independent: float) -> ClockBend | None:
-    """The bend by the clocks and the motion together; None where the clocks leave nothing open that matters, where a
-    bend does not look like motion, or where the motion tells more than the clocks can explain.
+    """The bend by the clocks and the motion together; None where the clocks leave nothing open that matters, or where
+    the motion tells more than the clocks can explain.
 
     `points` are those of both devices at the same times, with the mean lag taken out but for a part, which stays;
     `independent` is the share of them that are.
@@ -89,16 +87,14 @@ def clock_bend(sensor: Samples, reference: Samples, points: Points, independent:
     for _ in range(TURNS):
         at_s = points.time_s - found.at(points.time_s) - mean_s
         u, du = (_at(at_s, points.time_s, *own) for own in ((points.u, points.du), (points.du, second)))
-        found, left_s, like_motion = _nearer(found, points._replace(u=u, du=du), unit_s, independent)
-        if like_motion < LIKE_MOTION:
-            return None
+        found, left_s = _nearer(found, points._replace(u=u, du=du), unit_s, independent)
         mean_s += left_s
     return found if (np.abs(found.bend_s) <= WITHIN_U * unit_s).all() else None
 
 
-def _nearer(before: ClockBend, points: Points, unit_s: Array, independent: float) -> tuple[ClockBend, float, float]:
-    """The next one of the iteration, the mean lag in s that is left, and the part that looks like motion of what a bend
-    moves, from points of which `before` was taken out. `unit_s` (2,): what the clocks leave open.
+def _nearer(before: ClockBend, points: Points, unit_s: Array, independent: float) -> tuple[ClockBend, float]:
+    """The next one of the iteration, and the mean lag in s that is left, from points of which `before` was taken out.
+    `unit_s` (2,): what the clocks leave open.
 
     V is regressed on the motion and on the derivatives by the coefficients, by least squares. The coefficients'
     covariance is that of noise of the spectrum of the motion, or that of the sums over segments, each predicted by the
@@ -111,8 +107,6 @@ def _nearer(before: ClockBend, points: Points, unit_s: Array, independent: float
     now = replace(before, slopes=slopes)
     by_unit = now.derivatives(points) * unit_s[:, None, None]
     rest, *moved = (own - regression(basis, own) @ basis for own in (points.V.T, *by_unit))
-    alone, whole = (np.sum(np.square(own), axis=(1, 2)) for own in (moved, by_unit))
-    like_motion = 1.0 - float(np.min(alone / np.maximum(whole, np.finfo(float).tiny)))
     sd = np.sqrt(np.maximum(np.mean(rest**2, axis=1), np.finfo(float).tiny))[:, None]
     rest, by_bend = rest / sd, np.stack(moved) / sd
     information = np.einsum("kon,lon->kl", by_bend, by_bend) + NOTHING * np.eye(2)
@@ -127,7 +121,7 @@ def _nearer(before: ClockBend, points: Points, unit_s: Array, independent: float
     gain = np.linalg.solve(np.eye(2) + covariance, np.eye(2))
     root = np.asarray(unit_s[:, None] * np.linalg.cholesky(gain @ covariance), np.float64)
     left_s = -float(np.sum(slopes * rates) / max(float(np.sum(slopes**2)), np.finfo(float).tiny))
-    return replace(now, bend_s=unit_s * (gain @ (before.bend_s / unit_s + step)), root=root), left_s, like_motion
+    return replace(now, bend_s=unit_s * (gain @ (before.bend_s / unit_s + step)), root=root), left_s
 
 
 def _at(at_s: Array, time_s: Array, values: Array, rates: Array) -> Array:

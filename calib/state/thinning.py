@@ -26,6 +26,9 @@ WIDTHS = ((0.0, 1.0 / 24.0), (14.0, 1.0), (60.0, 7.0), (400.0, 14.0), (1200.0, 2
 # one, whose integrals are channels too. Of many positions and references the widths are doubled.
 MOST = 650
 WIDEST = 4096.0  # times the widths
+# Parts of what is open of the lag within windows that a merged record keeps: with two, as of one window, it would seem
+# better known after many windows than it is.
+BENDS = 12
 BRIEF_DAYS = 1.0  # so long Q is the same at all temperatures of a record
 BIN_K = 5.0  # records whose temperatures differ by more stay apart: S may depend on it
 
@@ -111,8 +114,8 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
 
 
 def _bends(records: Sequence[Record], root: Array, noise: Array) -> Array | None:
-    """(2, 2M, 3) what is open of the lag within the windows, as that of one record with this root and noise: times the
-    root of the number of windows, as if all were alike. Of all that they leave open, the two largest parts stay.
+    """(k, 2M, 3) what is open of the lag within the windows, as that of one record with this root and noise: times the
+    root of the number of windows, as if all were alike. Of all that they leave open, the BENDS largest parts stay.
     """
     if all(r.lag_bend is None for r in records):
         return None
@@ -121,8 +124,8 @@ def _bends(records: Sequence[Record], root: Array, noise: Array) -> Array | None
     moved = [back @ (own.T @ (own @ bend)) for own, bend in told]
     parts = np.concatenate(moved) / noise
     _, size, ways = np.linalg.svd(parts.reshape(len(parts), -1), full_matrices=False)
-    largest = np.sqrt(sum(r.windows for r in records)) * size[:2, None] * ways[:2]
-    return np.asarray(np.linalg.pinv(root, rcond=1e-9) @ (largest.reshape(2, -1, 3) * noise))
+    largest = np.sqrt(sum(r.windows for r in records)) * size[:BENDS, None] * ways[:BENDS]
+    return np.asarray(np.linalg.pinv(root, rcond=1e-9) @ (largest.reshape(len(largest), -1, 3) * noise))
 
 
 def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, Array, Array]:

@@ -220,11 +220,11 @@ class Record:
 
     @property
     def by_bend(self) -> Array:
-        """(2, 6M) what the slopes, whitened by the noise, are more for one standard uncertainty of each of two
+        """(k, 6M) what the slopes, whitened by the noise, are more for one standard uncertainty of each of k
         independent parts of what is open of the lag within the window."""
         if self.lag_bend is None:
-            return np.zeros((2, 6 * self.channels))
-        return np.asarray((self.root @ self.lag_bend / self.noise).reshape(2, -1))
+            return np.zeros((0, 6 * self.channels))
+        return np.asarray((self.root @ self.lag_bend / self.noise).reshape(len(self.lag_bend), -1))
 
     @property
     def lag_left_s(self) -> tuple[float, float]:

@@ -66,22 +66,21 @@ def test_an_unknown_begins_with_the_first_window_that_has_it_however_windows_wer
 
 
 def test_what_is_open_of_the_lag_within_windows_is_that_of_their_common_slopes() -> None:
-    """The slopes of a merged record differ from those of windows at their true lag by what each window's bend moves
-    them, as least squares over all of them says. Of one part in each of two windows nothing is lost."""
+    """The slopes of a merged record differ from those of windows at their true lag by what the bends of its windows
+    move them, as least squares over all of them says. Of two parts in each of six windows nothing is lost, also where
+    they are merged in two steps; two parts for all would be half of it."""
     random = np.random.default_rng(4)
-    bends = np.zeros((2, 2, 6, 3))
-    bends[:, 0] = 1e-3 * random.normal(size=(2, 6, 3))
+    bends = 1e-3 * random.normal(size=(6, 2, 6, 3))
+    roots = np.triu(random.normal(size=(6, 6, 6))) + 3.0 * np.eye(6)
     windows = [
-        replace(
-            told(BESIDE, Truth(S, Q), day), root=np.triu(random.normal(size=(6, 6))) + 3.0 * np.eye(6), lag_bend=bend
-        )
-        for day, bend in enumerate(bends)
+        replace(told(BESIDE, Truth(S, Q), 0.0), root=root, lag_bend=bend)
+        for root, bend in zip(roots, bends, strict=True)
     ]
-    both = merged(windows, S)
     power = [one.root.T @ one.root for one in windows]
-    moved = [np.linalg.solve(sum(power), P @ bend[0]) for P, bend in zip(power, bends, strict=True)]
+    moved = [np.linalg.solve(sum(power), P @ part) for P, bend in zip(power, bends, strict=True) for part in bend]
     scatter = sum(np.outer(m.ravel(), m.ravel()) for m in moved)
-    assert both.lag_bend is not None
-    parts = both.lag_bend.reshape(2, -1) / np.sqrt(2.0)
-    np.testing.assert_allclose(parts.T @ parts, scatter, atol=1e-9 * float(np.max(scatter)))
-    np.testing.assert_allclose(windows[0].by_bend[0], (windows[0].root @ bends[0, 0] / windows[0].noise).ravel())
+    for both in (merged(windows, S), merged([merged(windows[:2], S), merged(windows[2:], S)], S)):
+        assert both.lag_bend is not None
+        parts = both.lag_bend.reshape(len(both.lag_bend), -1) / np.sqrt(6.0)
+        np.testing.assert_allclose(parts.T @ parts, scatter, atol=1e-9 * float(np.max(scatter)))
+    np.testing.assert_allclose(windows[0].by_bend[1], (windows[0].root @ bends[0, 1] / windows[0].noise).ravel())
