@@ -90,6 +90,8 @@ REVISIONS = (
     Revision(25, "eae836b18aa3", "0.3.0"),
     # The last before the motion tells how the lag changes within a window.
     Revision(26, "1a5e5ccb6893", "0.3.0"),
+    # The last before merged records keep what is open of the lag within each of their windows.
+    Revision(27, "1736f5139b67", "0.3.0"),
 )
 
 
