@@ -1,8 +1,8 @@
 """Old records are merged: many windows of one setting become one record, which tells the same of all that is constant.
 
 A walk within the merged stretch is allowed for in the record's weight (calib.estimate.rows). Nothing is merged across a
-step, nor what differs in setting, in the directions that moved or in the response that the front end took out; lags are
-brought to one. A record without a temperature stays apart from those that have one.
+step, nor what differs in setting, in the directions that moved or in the response that the front end took out. The lag
+that each window has by itself is taken out before. A record without a temperature stays apart from those that have one.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from calib.model import Array
+from calib.windows.condense import regressed
 from calib.windows.deviations import Deviations, LeftOpen
 from calib.windows.excited import MotionSums
 from calib.windows.record import TERMS, TOLD, Record
@@ -29,6 +30,7 @@ WIDEST = 4096.0  # times the widths
 # Parts of what is open of the lag within windows that a merged record keeps: with two, as of one window, it would seem
 # better known after many windows than it is.
 BENDS = 12
+TURNS = 4  # of the lags of the windows and the slopes that they have in common
 BRIEF_DAYS = 1.0  # so long Q is the same at all temperatures of a record
 BIN_K = 5.0  # records whose temperatures differ by more stay apart: S may depend on it
 
@@ -65,7 +67,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
     """One record for several of one setting and response."""
     if len(records) == 1:
         return records[0]
-    first, m2 = records[0], 2 * records[0].channels
+    first = records[0]
 
     def each(name: str) -> list[Any]:
         return [getattr(r, name) for r in records]
@@ -77,7 +79,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
         return np.asarray(sum(w * value for w, value in zip(share, each(name), strict=True)))
 
     noise = np.sqrt(sum(w * value**2 for w, value in zip(share, each("noise"), strict=True)))
-    root, slopes, passed = _stacked(records, noise, m2)
+    lag_s, root, slopes, passed = _together(records, noise)
     mean_x = mean("mean_x")
     D = first.pose.direction
     # The means of V at one mean of the reference: its own motion moves them by S as nearly as nominal.
@@ -98,7 +100,7 @@ def merged(records: Sequence[Record], nominal: Array) -> Record:
     motions = [motion for motion in each("motion") if motion is not None]
     return replace(
         first,
-        day=by_windows("day"), days=days, windows=int(windows.sum()),
+        day=by_windows("day"), days=days, windows=int(windows.sum()), lag_s=lag_s,
         u_lag_s=_rms(share, each("u_lag_s")), attenuation=_rms(share, each("attenuation")),
         independent=by_windows("independent"), along=mean("along"),
         along_rate_s=mean("along_rate_s"), root=root, slopes=slopes, passed=passed,
@@ -128,16 +130,49 @@ def _bends(records: Sequence[Record], root: Array, noise: Array) -> Array | None
     return np.asarray(np.linalg.pinv(root, rcond=1e-9) @ (largest.reshape(len(largest), -1, 3) * noise))
 
 
-def _stacked(records: Sequence[Record], noise: Array, m2: int) -> tuple[Array, Array, Array]:
-    """R, R b and R P of all together.
+def _together(records: Sequence[Record], noise: Array) -> tuple[float, Array, Array, Array]:
+    """The lag in s that the windows have in common, and R, R b and R P of all together, each at a lag of its own.
+
+    The clocks leave `u_lag_s` of the lag of each window open. If that stayed in its slopes, it would be an error of the
+    merged ones of up to a hundred times their noise: windows move in other directions and at other frequencies, so that
+    no lag of them all explains it. So each has the lag that it would have if it were an unknown, with the clocks as its
+    prior: the b of all together tell it, and change by it.
+    """
+    m = records[0].channels
+    roots, slopes = np.array([r.root for r in records]), np.array([r.slopes for r in records])
+    weights = 1.0 / np.array([r.noise for r in records])[:, None] ** 2
+    clocks, independent = np.array([(r.u_lag_s**2 / r.windows, r.independent) for r in records]).T
+    at_s = np.array([r.lag_s for r in records])
+    common_s = float(at_s[0])
+    for _ in range(TURNS):
+        root, together, _ = _stacked(records, slopes, noise)
+        b = regressed(root, together)
+        by_lag = -roots[:, :, m:] @ b[:m]
+        square, told = (np.sum(by_lag * own * weights, axis=(1, 2)) for own in (by_lag, slopes - roots @ b))
+        if not square.any():
+            break
+        moving = square > 0.0
+        told_s = at_s + np.divide(told, square, out=np.zeros_like(told), where=moving)
+        u2 = np.divide(1.0, square * independent, out=np.full_like(square, np.inf), where=moving)
+        weight = 1.0 / (clocks + u2)
+        common_s = float(weight @ told_s / weight.sum())
+        next_s = common_s + clocks * weight * (told_s - common_s)
+        slopes = slopes - (next_s - at_s)[:, None, None] * by_lag
+        at_s = next_s
+    return common_s, *_stacked(records, slopes, noise)
+
+
+def _stacked(records: Sequence[Record], slopes: Array, noise: Array) -> tuple[Array, Array, Array]:
+    """R, R b and R P of all together, with these R b of each.
 
     A window's rows count by its own noise, as if all had the noise of the merged one.
     """
-    half, lag_s = m2 // 2, records[0].lag_s
+    half = records[0].channels
+    m2 = 2 * half
     by = [float(np.sqrt(np.mean(noise**2 / r.noise**2))) for r in records]
     wide = np.vstack([
-        b * np.hstack([r.root, r.slopes_at_lag(lag_s), r.passed.transpose(1, 0, 2).reshape(m2, -1)])
-        for b, r in zip(by, records, strict=True)
+        b * np.hstack([r.root, own, r.passed.transpose(1, 0, 2).reshape(m2, -1)])
+        for b, r, own in zip(by, records, slopes, strict=True)
     ])  # fmt: skip
     live = np.abs(wide[:, :m2]).max(axis=0, initial=0.0) > 0.0
     triangle = np.asarray(np.linalg.qr(np.hstack([wide[:, :m2][:, live], wide[:, m2:]]), mode="r"))

@@ -237,10 +237,6 @@ class Record:
         information = float(by_lag @ by_lag)
         return (-float(by_lag @ told) / information, information**-0.5) if information > 0.0 else (0.0, np.inf)
 
-    def slopes_at_lag(self, lag_s: float) -> Array:
-        """(2M, 3) the slopes as if `lag_s` had been taken out: of first order, as the equations within `u_lag_s`."""
-        return np.asarray(self.slopes - (lag_s - self.lag_s) * self.loadings[0].reshape(-1, 3) * self.noise)
-
     def with_gravity(self, ratio: float) -> Record:
         """The same with the stated gravity multiplied by `ratio`."""
         gravity = self.pose.gravity_mps2 * ratio

@@ -65,6 +65,41 @@ def test_an_unknown_begins_with_the_first_window_that_has_it_however_windows_wer
     assert estimate(records, stated).days[0] == 0.0
 
 
+def test_windows_with_lags_of_their_own_tell_together_what_they_tell_apart() -> None:
+    """Each of 30 windows moves another way and has its own lag, of which the clocks leave 1 ms open. S by the merged
+    record is that of least squares over all slopes with a lag for each window, within 0.3 of its u, and its rows have
+    no more scatter than noise. With the lag of the first window for all
+    it was 5 u off."""
+    random, omega, noise, count = np.random.default_rng(7), 4.0, 1e-3, 30
+    windows, columns, observed = [], [], []
+    for w in range(count):
+        root = np.triu(random.normal(size=(6, 6))) + 2.0 * np.eye(6)
+        root[:, 3:] *= omega
+        lag_s = 1e-3 * random.normal()
+        slopes = root @ np.vstack([S, -lag_s * S]) + noise * random.normal(size=(6, 3))
+        taken_s = lag_s if w % 2 else 0.0  # from half of them the front end took it out
+        slopes[:, :] += taken_s * root[:, 3:] @ S
+        windows.append(replace(told(BESIDE, Truth(S, Q), 0.0), root=root, slopes=slopes, lag_s=taken_s, u_lag_s=1e-3))
+        own = np.zeros((18, 9 + count))
+        own[:, :9] = np.kron(root[:, :3], np.eye(3))
+        own[:, 9 + w] = (-root[:, 3:] @ S).ravel()
+        columns.append(own)
+        observed.append(slopes.ravel())
+    exact, covariance = _least_squares(np.vstack(columns), np.concatenate(observed), noise)
+    for one in (merged(windows, S), merged([merged(windows[:9], S), merged(windows[9:], S)], S)):
+        by_one_lag = np.column_stack([np.kron(one.root[:, :3], np.eye(3)), (-one.root[:, 3:] @ S).ravel()])
+        found, _ = _least_squares(by_one_lag, one.slopes.ravel(), noise)
+        u = np.sqrt(np.diag(covariance)[:9])
+        np.testing.assert_array_less(np.abs(found[:9] - exact[:9]) / u, 0.3)
+        left = (one.slopes.ravel() - by_one_lag @ found) / noise
+        assert left @ left < 25.0  # of 18 rows and 10 unknowns
+
+
+def _least_squares(columns: np.ndarray, observed: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    found, *_ = np.linalg.lstsq(columns, observed, rcond=None)
+    return found, noise**2 * np.linalg.inv(columns.T @ columns)
+
+
 def test_what_is_open_of_the_lag_within_windows_is_that_of_their_common_slopes() -> None:
     """The slopes of a merged record differ from those of windows at their true lag by what the bends of its windows
     move them, as least squares over all of them says. Of two parts in each of six windows nothing is lost, also where
