@@ -72,6 +72,20 @@ class Points(NamedTuple):
         found = found[: self.own_u.shape[1]]
         return found if self.most_noise is None else np.minimum(found, self.most_noise)
 
+    @property
+    def without_line(self) -> Points:
+        """The samples beside an AC-coupled reference without their straight lines over time; others as they are.
+
+        The zero error of the reference gives its integral a straight line, which is taken out over all samples that are
+        integrated together. Of these a loud part tells that line worse than the motion of a quiet part needs it.
+        """
+        if self.own_u.shape[1] == self.u.shape[1]:
+            return self
+        line = self.time_s - self.time_s.mean()
+        unit = line / max(float(line @ line), np.finfo(float).tiny)
+        V, u, du = (own - np.outer(line, unit @ own) for own in (self.V, self.u, self.du))
+        return self._replace(V=V, u=u, du=du)
+
     def within(self, start_s: float, stop_s: float) -> Points:
         """The samples from one time to another, both included."""
         first, stop = np.searchsorted(self.time_s, start_s), np.searchsorted(self.time_s, stop_s, "right")
@@ -141,7 +155,7 @@ def judged(
     for first, stop in _unbroken(points.time_s):
         longest = round(limits.longest_s * _rate(points.time_s[first:stop]))
         for a, b in _pieces(first, stop, longest):
-            part = points.part(a, b)
+            part = points.part(a, b).without_line
             known = noise if b - a == len(points.time_s) else None
             windows.append(_motion(kind, pose, part, _rate(part.time_s), limits, leave_out, taper, noise=known))
     return windows

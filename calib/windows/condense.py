@@ -228,6 +228,7 @@ def _roots(power: Array, left: tuple[Array, Array]) -> tuple[Array, Array]:
     strongest = np.repeat(own.reshape(len(own), 2, half).max(axis=2, initial=0.0), half, axis=1)
     limit = np.maximum(np.maximum(PIVOT_FLOOR * own, EXCITED * strongest), rounded)
     moved = own > np.maximum(limit, NOISE_LEFT * noise)  # a silent channel must not correlate its column with others
+    moved[:, half + own_channels(half) :] = False  # the derivative of an integral is its own channel
     power = np.where(moved[:, :, None] & moved[:, None], power, 0.0)
     work = np.concatenate([power, np.broadcast_to(np.eye(size), power.shape)], axis=2)
     rows = np.zeros_like(work)
