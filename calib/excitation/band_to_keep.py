@@ -31,6 +31,9 @@ AS_FAST = 0.9  # of the sensor's rate; two devices of one nominal rate differ by
 # Power over that of the quietest window: with more, motion is in the noise; from MOSTLY on it is most of it, and the
 # share that the sensor shows, which is right to a tenth or so, leaves nothing, or several times the noise.
 BESIDE_MOTION, MOSTLY = 1.5, 5.0
+# Of what looks like noise and is all motion, the power that still counts as noise. It moves nothing. But without noise
+# the bands of a window reach further than with it, and those of the filter's edge show another response.
+STAYS = 1e-4
 
 
 def band_to_keep(
@@ -66,7 +69,7 @@ def band_to_keep(
     if noisy and found_hz is not None and len(together):
         beyond_hz = found_hz, BAND * min(rates_hz)
         moves = moving_share(together[:, 3:], together[:, :3], rates_hz[1], beyond_hz, derivatives)
-        density = np.maximum(_of_quieter(density, density * np.sqrt(1.0 - moves), most), stated)
+        density = np.maximum(_of_quieter(density, density * np.sqrt(np.maximum(1.0 - moves, STAYS)), most), stated)
     u_noise = U_NOISE
     if found_hz is None and not stated:
         all_left = quietest(raw, rate_hz)
