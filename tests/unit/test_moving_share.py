@@ -7,7 +7,11 @@ import pytest
 
 from calib import calibrate
 from calib.excitation.detection import moving_share
+from calib.excitation.front_end import aligned
 from calib.model import Array
+from calib.signal.instrument import Instrument
+from calib.signal.samples import Samples
+from calib.signal.stamps import clock_from_stamps
 
 RATE_HZ, POINTS = 250.0, 15_000
 OWN_MPS2, SENSOR_MPS2 = 2e-3, 3e-3  # noise of the reference and of the sensor
@@ -39,6 +43,19 @@ def test_the_share_of_a_floor_that_moves_is_found(floor_mps2: float) -> None:
     if not floor_mps2:
         assert not found.any()
     np.testing.assert_allclose(found.mean(axis=0), motion / (motion + noise), atol=0.08)  # z is 16 % noise
+
+
+def test_what_looks_like_noise_and_is_motion_still_has_a_band() -> None:
+    """The sensor shows all of it, so the noise that is subtracted is next to nothing. With none at all the bands of
+    the filter's edge would count in this window, and not in the next one."""
+    clock = clock_from_stamps(np.arange(POINTS) / RATE_HZ)
+    for seed in range(6):
+        u, V, _ = pair(seed, 0.005, 1e-5)
+        sensor, reference = Samples("sensor", 0, V, clock), Samples("reference", 0, u, clock)
+        found = aligned(sensor, reference, Instrument(), (2.0, 58.0))
+        assert found is not None
+        assert found.band_hz is not None
+        assert (found.reference_noise > 0.0).all()
 
 
 def test_a_direction_in_which_nothing_moves_shows_noise() -> None:
