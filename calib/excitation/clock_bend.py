@@ -21,7 +21,9 @@ from calib.signal.samples import Samples
 # Standard uncertainties of the first and the second Legendre coefficient of a parabola that was fitted to evenly spaced
 # points, over that of its value at the end: sqrt(2 k + 1) / 3.
 OF_END = np.sqrt([3.0, 5.0]) / 3.0
-WITHIN_U = 4.0  # of what the clocks leave open: what is further away is something else
+# Of what the clocks leave open: what is further away is something else. Stalls are rare and long, so that two in 150
+# minutes of late reads were right, and beyond 4.
+WITHIN_U = 8.0
 LEAST_RAD = 3e-3  # of phase that the clocks leave open: less changes S by less than 1e-5
 TURNS = 3  # each one leaves some per cent of the bend
 SEGMENTS, FEWEST_POINTS = 32, 20  # of a stretch, whose scatter is that of the result, and points in each

@@ -133,6 +133,14 @@ def test_a_lag_that_no_clock_explains_stays() -> None:
     assert bend_of(points(4, 10.0 * OF_END * U_END_S)) is None
 
 
+def test_a_rare_stall_bends_a_clock_by_more_than_its_scatter_says() -> None:
+    """Six standard uncertainties of the clocks, which the motion tells to a hundredth of one."""
+    bend_s = 6.0 * OF_END * U_END_S
+    found = bend_of(points(4, bend_s))
+    assert found is not None
+    np.testing.assert_allclose(found.bend_s, bend_s, rtol=0.02)
+
+
 def test_a_file_whose_clock_has_several_pieces_is_left_alone() -> None:
     assert clock_bend(*devices(U_END_S, knots=4), points(5, np.array([1e-3, 0.0])), 0.32) is None
 
