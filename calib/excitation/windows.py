@@ -22,6 +22,7 @@ from calib.excitation.rests import find_rests
 from calib.excitation.steadiness import nonlinearity, step
 from calib.excitation.window_verdict import DEFAULT_LIMITS, Limits, Verdict, judge
 from calib.model import Array, BandSums, Pose, Window, WindowSums, own_channels
+from calib.signal.band import hanning
 from calib.signal.order_statistics import median
 from calib.signal.stamps import OFF_S
 from calib.windows.bands import band_sums
@@ -30,6 +31,7 @@ from calib.windows.sums import pool, window_sums
 CALM = "the reference is calm here"  # compared with the rest of the samples
 CLEARLY = 0.8  # least share of the power of that output, that is motion
 FOLLOWS = 0.3  # least share of what the motion moves, as amplitudes, that the output along it has
+CYCLES, SLOW = 5, 1e-2  # of a motion that is no straight line; of its power, what may be slower
 SHORTEST_QUIET_S = 1.0  # a shorter pause makes no window of kind "quiet"
 
 
@@ -74,17 +76,20 @@ class Points(NamedTuple):
 
     @property
     def without_line(self) -> Points:
-        """The samples beside an AC-coupled reference without their straight lines over time; others as they are.
+        """The samples beside an AC-coupled reference without their straight lines over time; others as they are, and
+        those of a motion that makes fewer than CYCLES.
 
         The zero error of the reference gives its integral a straight line, which is taken out over all samples that are
         integrated together. Of these a loud part tells that line worse than the motion of a quiet part needs it.
         """
-        if self.own_u.shape[1] == self.u.shape[1]:
+        if self.own_u.shape[1] == self.u.shape[1] or len(self.u) < 2:
             return self
         line = self.time_s - self.time_s.mean()
-        unit = line / max(float(line @ line), np.finfo(float).tiny)
+        unit = line / float(line @ line)
         V, u, du = (own - np.outer(line, unit @ own) for own in (self.V, self.u, self.du))
-        return self._replace(V=V, u=u, du=du)
+        power = np.sum(np.abs(np.fft.rfft((V - V.mean(axis=0)) * hanning(len(V))[:, None], axis=0)) ** 2, axis=1)
+        cycles = int(np.searchsorted(np.cumsum(power), SLOW * power.sum()))  # that the motion makes at least
+        return self if cycles < CYCLES else self._replace(V=V, u=u, du=du)
 
     def within(self, start_s: float, stop_s: float) -> Points:
         """The samples from one time to another, both included."""

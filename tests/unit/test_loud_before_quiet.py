@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from calib.excitation.front_end import Settings, windows_of
+from calib.excitation.windows import Points
 from calib.model import Array, Pose, Window
 from calib.signal.instrument import Instrument
 from calib.signal.samples import Samples
@@ -53,3 +54,17 @@ def test_the_slopes_of_the_quiet_window_are_right(loud_mps2: float) -> None:
         statistics.append(record.independent * float(np.sum(left[live] ** 2)))
     # Of 6 x 27 rows: 1 with a standard deviation of 0.11; what the reference's noise adds is small.
     assert 0.6 < np.mean(statistics) / 27.0 < 1.45
+
+
+def test_slow_waves_keep_their_lines() -> None:
+    """Ten seconds of waves of nine seconds are half a line: without it they would tell another mixture of frequencies
+    than there is. The same samples with motion of 3 Hz in their place lose it, and all columns alike."""
+    t = np.arange(1250) / RATE_HZ
+    for hz, kept in ((0.11, True), (3.0, False)):
+        phase = 2.0 * np.pi * hz * t
+        u = np.column_stack([np.sin(phase + k) for k in range(6)]) + 1e-3 * t[:, None]
+        points = Points(t, u[:, :3] + 0.1, u, 2.0 * np.pi * hz * np.column_stack([np.cos(phase + k) for k in range(6)]))
+        assert (points.without_line is points) == kept
+        slopes = [abs(np.polyfit(t, own, 1)[0]).max() for own in points.without_line[1:4]]
+        assert (max(slopes) < 1e-9) != kept
+    np.testing.assert_allclose(points.without_line.V.mean(axis=0), points.V.mean(axis=0))
