@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from calib.excitation.front_end import Settings, windows_of
 from calib.excitation.windows import Points
 from calib.model import Array, Pose, Window
+from calib.signal.corner import integral
 from calib.signal.instrument import Instrument
 from calib.signal.samples import Samples
 from calib.signal.stamps import clock_from_stamps
@@ -68,3 +69,19 @@ def test_slow_waves_keep_their_lines() -> None:
         slopes = [abs(np.polyfit(t, own, 1)[0]).max() for own in points.without_line[1:4]]
         assert (max(slopes) < 1e-9) != kept
     np.testing.assert_allclose(points.without_line.V.mean(axis=0), points.V.mean(axis=0))
+
+
+def test_a_blow_at_the_end_does_not_tilt_the_integral_of_the_quiet_time_before() -> None:
+    """The zero error gives the integral a straight line, which is that of the quiet time; by least squares over all
+    samples alike it would be off by more than twice the motion there."""
+    t = np.arange(7500) / RATE_HZ
+    quiet = np.sin(2.0 * np.pi * 1.1 * t)
+    blow = np.where(t > 54.0, -100.0 * np.exp((54.0 - t) / 3.0), 0.0)
+    exact = quiet + blow
+    x = np.gradient(exact, 1.0 / RATE_HZ) / (2.0 * np.pi) + 1e-2
+    found = integral(x[:, None], RATE_HZ)[:, 0]
+    left = (found - exact)[200:6500]
+    assert np.ptp(left) < 0.25
+    alike = 2.0 * np.pi * np.cumsum(x) / RATE_HZ
+    alike -= np.polyval(np.polyfit(t, alike, 1), t)
+    assert np.ptp((alike - exact)[200:6500]) > 2.0
