@@ -131,8 +131,7 @@ def run_cli(arguments: list[str] | None = None) -> int:
         return INTERRUPTED
     except OSError as error:
         _discard_output()
-        told = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else error.strerror or error
-        click.echo(f"fieldcal: {told}", err=True)
+        click.echo(f"fieldcal: {error}", err=True)
         return 1
     except SystemExit as error:
         if COMPLETION in os.environ:  # click ends so after it has answered the shell
