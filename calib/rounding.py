@@ -9,13 +9,14 @@ KNOWN_BEFORE = "*"  # marks a parameter that a nominal value or a prior tells ra
 
 
 def plus_minus(value: float | None, expanded: float | None) -> str:
-    """`value ± U`, both rounded to the second digit of U; `–` if there is no value."""
+    """`value ± U`, both rounded to the second digit of U (GUM 7.2.6); `–` if there is no value."""
     if value is None or not math.isfinite(value):
         return "–"
     if expanded is None or not math.isfinite(expanded) or expanded <= 0:
         return f"{value:.6g} ± ?"
-    decimals = max(0, 1 - math.floor(math.log10(expanded)))
-    return f"{value:.{decimals}f} ± {expanded:.{decimals}f}"
+    decimals = 1 - int(f"{expanded:.1e}".partition("e")[2])  # below 0: tens, hundreds, ...
+    told = [round(number, decimals) + 0.0 for number in (value, expanded)]  # + 0.0: no value is -0
+    return " ± ".join(f"{number:.{max(0, decimals)}f}" for number in told)
 
 
 def rounded(value: float) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 
 from agent import __version__
 from agent.config.files import read_file
+from agent.config.whole_files import new_file
 from agent.config.xml import check_xml
 from agent.reading.source import TableError
 from agent.reading.stationxml import LARGEST, StationChannel, import_obspy
@@ -171,7 +172,7 @@ def write_proposed(metadata: Path, to: Path, compared: Sequence[Mapping[str, Any
                     if told := found.get((seed_id, from_s)):
                         _propose(obspy, channel, told)
         try:
-            with to.open("xb") as file:
+            with new_file(to) as file:
                 inventory.write(file, format="STATIONXML")
         except FileExistsError:
             raise TableError(f"{to}: the file exists; remove it, or choose another name") from None

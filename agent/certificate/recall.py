@@ -18,6 +18,7 @@ import numpy as np
 from agent import __version__
 from agent.calibrate.origin import source_file
 from agent.config.files import read_file
+from agent.config.whole_files import write_whole
 from agent.core.events import CalibrationUpdate, SharedError
 from agent.delivery.calibrations import calibrations
 from agent.delivery.history import FILE_NAME, History
@@ -222,9 +223,9 @@ def write(objects: Sequence[dict[str, Any]], directory: Path, key: Ed25519Privat
         }
         listed.append({"file": name, **entry, "reason": one["reason"]})
         if name is not None:
-            (directory / name).write_bytes(_signed(one, name, key))
+            write_whole(directory / name, _signed(one, name, key))
     summary = {"results": listed, "corrected": sum(e["file"] is not None for e in listed), "version": __version__}
-    (directory / "recall.json").write_bytes(_signed(summary, "recall.json", key))
+    write_whole(directory / "recall.json", _signed(summary, "recall.json", key))
     return summary
 
 

@@ -15,6 +15,7 @@ from agent.certificate.pdf import pdf
 from agent.certificate.schema import check_schema
 from agent.certificate.signing import CertificateSigner, as_json
 from agent.certificate.x509 import X509Signer
+from agent.config.whole_files import write_together
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -32,7 +33,7 @@ def write(
     """Write the certificate in all forms into `directory`, which is created if needed, and its signatures.
 
     With `xsd`, the schema of the DCC, the XML must be valid. Raises OSError, CertificateError and SchemaError; with the
-    latter two nothing is written.
+    latter two nothing is written. A disk that is full leaves what was there before.
     """
     signer = CertificateSigner(key, c.number)
     xml = dcc(c, signer)  # the only form that can refuse a content, so it is made first
@@ -49,6 +50,5 @@ def write(
     if x509 is not None:
         files |= x509.files(files)
     directory.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        (directory / name).write_bytes(content)
+    write_together(directory, files)
     return [directory / name for name in files]

@@ -14,6 +14,7 @@ from agent.calibrate.origin import origin
 from agent.calibrate.printing import print_outcome, print_warnings
 from agent.calibrate.station import differences, write_proposed
 from agent.cli.finite import Finite
+from agent.config.whole_files import status_of, write_whole
 from agent.reading.dates import ORDERS
 from agent.reading.source import TableError
 from agent.terminal.text import say
@@ -122,7 +123,8 @@ def _u(name: str, told: str) -> Callable[[Any], Any]:
 def calibrate(*, everything: bool, **options: Any) -> int:
     """Calibrate from files: sensor.csv, reference.csv, poses.csv.
 
-    Exit status 0 if the calibration is valid, 2 on bad input, 3 if the data are refused. The reasons are printed.
+    Exit status 0 if the calibration is valid, 1 if the disk is full, 2 on bad input, 3 if the data are refused. The
+    reasons are printed.
     """
     try:
         outcome = calibrated(options)
@@ -134,18 +136,27 @@ def calibrate(*, everything: bool, **options: Any) -> int:
         return 2
     for line in differences(outcome.more.get("station", ())):
         say(line, err=True)
-    json_to: Path | None = options["json_to"]
+    json_to = Path(options["json_to"]) if options["json_to"] else None
+    unwritten = 0
     if json_to is not None:
         told = as_json(replace(outcome, more={**outcome.more, **origin(options)}))
         try:
-            with click.open_file(str(json_to), "w") as file:
-                file.write(told + "\n")
-        except OSError as error:
-            raise click.BadParameter(f"{json_to}: {error.strerror}", param_hint="--json") from None
+            _write(json_to, told + "\n")
+        except OSError as error:  # the result is printed all the same
+            say(f"fieldcal calibrate: {json_to}: {error.strerror}", err=True)
+            unwritten = status_of(error)
     if json_to == Path("-"):
         print_warnings(outcome.warnings, err=True)
     else:
         print_outcome(outcome, everything=everything)
     for reason in outcome.reasons:
         say(f"refused: {reason}", err=True)
-    return 3 if outcome.reasons else 0
+    return unwritten or (3 if outcome.reasons else 0)
+
+
+def _write(to: Path, text: str) -> None:
+    """Write to a file, or to standard output for -. Raises OSError."""
+    if to == Path("-"):
+        click.echo(text, nl=False)
+    else:
+        write_whole(to, text.encode())

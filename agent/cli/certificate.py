@@ -12,6 +12,7 @@ import click
 from agent.cli.data_dir import DATA_DIR, files_or
 from agent.config.key_file import KeyFileError, load_private_key
 from agent.config.reading import ConfigError
+from agent.config.whole_files import status_of, write_whole
 from agent.terminal.text import say
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -99,7 +100,7 @@ def make(inputs: Sequence[Path], output: Path, options: CertificateOptions) -> i
             error, f"{stated or '--state'}: " if isinstance(error, CertificateError) else "", output
         ):
             say(f"fieldcal certificate: {line}", err=True)
-        return 2
+        return status_of(error)
     for notice in material.notices:
         say(f"fieldcal certificate: {notice}", err=True)
     for warning in made.result.warnings:
@@ -136,5 +137,5 @@ def _keep_statements(text: str, path: Path, stated: Path | None) -> list[Path]:
     """Write the statements into the directory of the certificate, but not over the file that states the others."""
     if not text or (stated is not None and stated.resolve() == path.resolve()):
         return []
-    path.write_text(text, encoding="utf-8")
+    write_whole(path, text.encode())
     return [path]

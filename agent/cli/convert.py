@@ -9,6 +9,7 @@ import click
 import numpy as np
 
 from agent.calibrate.calibrating import as_arguments, by_driver, reference_of, sensor_of
+from agent.config.whole_files import new_file, status_of
 from agent.reading.dates import ORDERS
 from agent.reading.formats import Description
 from agent.reading.source import ROWS_AT_ONCE, TableError
@@ -59,6 +60,9 @@ def convert(file: Path, output: Path, role: str, columns: str | None, sensitivit
     except FileExistsError:
         say(f"fieldcal convert: {output}: the file exists; remove it, or choose another name", err=True)
         return 2
+    except OSError as error:
+        say(f"fieldcal convert: {error.filename}: {error.strerror}", err=True)
+        return status_of(error)
     say(f"{output}: {rows} rows of {','.join(names)}")
     for argument in as_arguments(by_driver(role, filters)):
         say(f"its driver states a filter, which the CSV cannot hold; calibrate with {argument}", err=True)
@@ -76,13 +80,9 @@ def _names(quantity: str, channels: int) -> tuple[str, ...]:
 
 def _write(path: Path, names: list[str], values: list[Slices]) -> int:
     """Write the columns so that reading them gives the same numbers; a gap is written as nan."""
-    try:
-        file = path.open("x", encoding="ascii")
-    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
-        raise TableError(f"{path}: {error.strerror}") from None
-    with file:
-        file.write(",".join(names) + "\n")
+    with new_file(path) as file:
+        file.write(f"{','.join(names)}\n".encode())
         for first in range(0, len(values[0]), ROWS_AT_ONCE):
             part = np.column_stack([v[first : first + ROWS_AT_ONCE] for v in values]).tolist()
-            file.writelines(",".join(map(repr, row)) + "\n" for row in part)
+            file.writelines(f"{','.join(map(repr, row))}\n".encode() for row in part)
     return len(values[0])

@@ -11,6 +11,7 @@ import click
 from agent.cli.data_dir import DATA_DIR
 from agent.cli.finite import Finite
 from agent.cli.rules import check_rules
+from agent.config.whole_files import status_of
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def export(
             say(f"fieldcal export: {number} samples have no acceleration: {why}", err=True)
     except (ExportError, StoreError, WatchError, OSError) as error:
         say(f"fieldcal export: {_fault_line(error, to or mcap)}", err=True)
-        return 2
+        return status_of(error)
     return 0
 
 

@@ -9,6 +9,7 @@ import msgspec
 
 from agent.cli.data_dir import DATA_DIR, files_or
 from agent.config.key_file import KeyFileError, load_private_key
+from agent.config.whole_files import status_of
 from agent.terminal.text import say
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -57,7 +58,7 @@ def recall(
         return 2
     except OSError as error:
         say(f"fieldcal recall: {error.filename or output}: {error.strerror or error}", err=True)
-        return 2
+        return status_of(error)
     listed = summary["results"]
     if json_to is not None:
         click.echo(msgspec.json.encode({"results_read": len(found), **summary}).decode())

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from agent.cli.data_dir import DATA_DIR, files_or
+from agent.config.whole_files import status_of
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def report(
         write(material, output)
     except OSError as error:
         say(f"fieldcal report: {error.filename or output}: {error.strerror}", err=True)
-        return 2
+        return status_of(error)
     say(str(output / "report.html"))
     return _status(material)
 

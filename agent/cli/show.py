@@ -14,6 +14,7 @@ import msgspec
 
 from agent import __version__
 from agent.cli.rules import check_rules
+from agent.config.whole_files import status_of, write_whole
 from agent.core.events import RESULTS, CalibrationUpdate, StatusChange, WindowReport
 from agent.delivery.calibrations import calibrations
 from agent.delivery.history import FILE_NAME, History, StoredResult, StoreError
@@ -96,7 +97,7 @@ def show(
         if error.filename is None:  # of standard output
             raise
         say(f"fieldcal show: {error.filename or data_dir}: {error.strerror}", err=True)
-        return 2
+        return status_of(error)
 
 
 def _show_overview(overview: Overview, json_to: str | None) -> int:
@@ -112,7 +113,7 @@ def _write_json(found: dict[str, Any], to: str) -> None:
     if to == "-":
         click.echo(data.decode())
     else:
-        Path(to).write_bytes(data + b"\n")
+        write_whole(Path(to), data + b"\n")
 
 
 def _check_recordings(context: click.Context, *, needed: bool) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from agent.cli.rules import check_rules
 from agent.cli.simulate_fleet import FleetOptions, fleet_options, serve_fleet
+from agent.config.whole_files import whole_file, write_whole
 from agent.delivery.ending import StopRequest
 from agent.terminal.text import say
 from hw.virtual.bench import Bench, Truth
@@ -150,11 +151,12 @@ def write_files(bench: Bench, directory: Path, duration_s: float | None, origin:
         "nominal_sensitivity": p.sensor.nominal_sensitivity,
         **_json_ready(recording.truth),
     }
-    (directory / "truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+    write_whole(directory / "truth.json", f"{json.dumps(truth, indent=2)}\n".encode())
 
 
 def _write_csv(path: Path, header: str, formats: list[str], rows: NDArray[np.float64]) -> None:
-    np.savetxt(path, rows, fmt=formats, delimiter=",", header=header, comments="")
+    with whole_file(path) as file:
+        np.savetxt(file, rows, fmt=formats, delimiter=",", header=header, comments="")
 
 
 def _json_ready(truth: Truth) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from agent.cli.leading import (
     with_filters,
 )
 from agent.config import Channel, Config, ConfigError, load_config, parse_config
+from agent.config.whole_files import status_of
 from agent.terminal.text import say
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def visit(config: Path | None, sensors: tuple[str, ...], json_to: Path | None, s
                 file.write(json.dumps(told) + "\n")
     except (ConfigError, ValueError, OSError) as error:
         say_fault(error, "visit", options["data_dir"], "--data-dir")
-        return 2
+        return status_of(error)
     return 0 if complete else 3
 
 

@@ -9,15 +9,17 @@ from pathlib import Path
 from agent.core.memory import Memory
 from agent.core.pipeline import Pipeline
 from agent.export.samples import ExportError, followed, start_of, steps_of
-from agent.recording.in_order import OrderError, in_order
+from agent.recording.in_order import OrderError, of_one_gateway
 
 
 def in_order_of(paths: Sequence[Path]) -> list[Path]:
     """Recordings of one gateway, the oldest first. Raises ExportError."""
     try:
-        return in_order([(path, start_of(path)) for path in paths])
+        return of_one_gateway([(path, start_of(path)) for path in paths])
     except OrderError as error:
         raise ExportError(str(error)) from None
+    except OSError as error:
+        raise ExportError(f"{error.filename}: {error.strerror}") from None
 
 
 def memories_at_the_end(paths: Sequence[Path]) -> list[Memory]:

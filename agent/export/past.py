@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from agent.config.whole_files import new_file
 from agent.core.events import CalibrationUpdate, RunStart, StatusChange
 from agent.core.kept import update_of
 from agent.core.memory import Memory
@@ -18,7 +19,7 @@ from agent.core.snapshot import unpack
 from agent.delivery.calibrations import first_in_force
 from agent.delivery.history import History
 from agent.export.at_the_end import memories_at_the_end
-from agent.export.samples import followed, new_file, steps_of
+from agent.export.samples import followed, steps_of
 from agent.export.smoothing import date_of, smoothing
 from agent.export.tables import cell
 from calib.model import PARAMETERS, Array

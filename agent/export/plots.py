@@ -9,9 +9,10 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from agent import __version__
+from agent.config.whole_files import new_file
 from agent.core.events import CalibrationUpdate
 from agent.export.cdr import DEFINITIONS, IMU, JOINT_STATE, imu, joint_state
-from agent.export.samples import ExportedSamples, RecordedContent, new_file
+from agent.export.samples import ExportedSamples, RecordedContent
 from calib.model import PARAMETERS, Array
 
 AXES = ("x", "y", "z")

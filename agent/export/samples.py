@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,17 +75,6 @@ def suspect(content: RecordedContent, suspicion: Suspicion | None) -> None:
     content.suspicion = suspicion
     if suspicion is not None:
         content.calibrations = [suspicion.update(update) for update in content.calibrations]
-
-
-@contextmanager
-def new_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write, which must not exist. It is removed again where writing fails. Raises OSError."""
-    with path.open("xb") as file:
-        try:
-            yield file
-        except BaseException:
-            path.unlink(missing_ok=True)
-            raise
 
 
 @contextmanager

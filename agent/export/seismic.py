@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.export.samples import ExportedSamples, ExportError, RecordedContent, new_file
+from agent.config.whole_files import new_file
+from agent.export.samples import ExportedSamples, ExportError, RecordedContent
 from agent.export.tables import columns
 
 NETWORK = "XX"  # of the FDSN: for data that belong to no registered network

@@ -18,8 +18,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from agent import __version__
+from agent.config.whole_files import new_file
 from agent.export.past import Made, SensorPast
-from agent.export.samples import ExportError, RecordedContent, new_file
+from agent.export.samples import ExportError, RecordedContent
 from agent.export.seismic import INDICATION, NETWORK, channel_code, station_code
 from agent.export.smoothing import smoothing
 from agent.terminal.text import one_line

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.export.samples import ExportedSamples, ExportError, RecordedContent, new_file
+from agent.config.whole_files import new_file
+from agent.export.samples import ExportedSamples, ExportError, RecordedContent
 from agent.terminal.text import no_formula, one_line
 from calib.model import Array
 

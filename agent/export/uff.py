@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from agent.export.samples import ExportedSamples, ExportError, RecordedContent, new_file
+from agent.config.whole_files import new_file
+from agent.export.samples import ExportedSamples, ExportError, RecordedContent
 from agent.export.tables import columns, names_of
 from calib.model import Array
 

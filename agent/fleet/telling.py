@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from agent import __version__
+from agent.config.whole_files import write_whole
 from agent.fleet.adjusting import Adjusted
 from agent.terminal.text import say
 from calib.model import Array
@@ -133,10 +134,10 @@ def as_json(value: dict[str, Any]) -> str:
 def write(told: dict[str, Any], directory: Path) -> None:
     """Write site.json, and device-NUMBER.json for each device, in the order of site.json. Raises OSError."""
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "site.json").write_text(as_json(told) + "\n")
+    write_whole(directory / "site.json", f"{as_json(told)}\n".encode())
     for number, (name, device) in enumerate(told["devices"].items(), start=1):
         own = {"device": name, "status": told["status"], "reasons": told["reasons"], **device, "method": METHOD}
-        (directory / f"device-{number}.json").write_text(as_json(own) + "\n")
+        write_whole(directory / f"device-{number}.json", f"{as_json(own)}\n".encode())
 
 
 def show(found: Adjusted) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import smtplib
 import ssl
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from email.message import EmailMessage
+from email.utils import make_msgid
 from typing import Any
-from urllib.error import HTTPError
+from urllib.error import HTTPError, URLError
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 import msgspec
@@ -30,7 +32,11 @@ class Notice(msgspec.Struct, frozen=True):
     @property
     def line(self) -> str:
         """One line of text, whatever the bus has sent."""
-        return _CONTROL.sub("\ufffd", f"{self.subject}: {self.text}")
+        return _one_line(f"{self.subject}: {self.text}")
+
+
+class SomeRefusedError(Exception):
+    """The mail server has taken a mail for some recipients only: these must not get it again."""
 
 
 class _NoRedirect(HTTPRedirectHandler):
@@ -58,23 +64,28 @@ def post(url: str, notices: Sequence[Notice]) -> None:
         build_opener(_NoRedirect).open(request, timeout=TIMEOUT_S).close()
     except HTTPError as error:
         error.close()
-        raise OSError(f"the webhook at {request.host} answers {error.code}") from None
+        raise OSError(f"it answers {error.code}") from None
 
 
 def message_of(email: Email, notices: Sequence[Notice]) -> EmailMessage:
-    """The mail. What the bus sent is in the body alone; a header with a line break raises ValueError."""
+    """The mail, of now. Texts of the bus are in the body alone, the name of the first subject in the header too."""
     message = EmailMessage()
     count = len(notices)
-    message["Subject"] = (
+    message["Subject"] = _one_line(
         f"fieldcal: {count} notice{'s' if count > 1 else ''}, {notices[0].kind} of {notices[0].subject}"
     )
     message["From"], message["To"] = email.sender, ", ".join(email.recipients)
+    message["Date"] = datetime.now(UTC)
+    message["Message-ID"] = make_msgid(domain=email.sender.rpartition("@")[2])
+    message["Auto-Submitted"] = "auto-generated"  # RFC 3834: no program answers it
     message.set_content(text_of(notices) + "\n")
     return message
 
 
 def mail(email: Email, notices: Sequence[Notice]) -> None:
-    """Send a mail. Raises OSError, ValueError or SMTPException where it is not taken."""
+    """Send a mail. Raises OSError, ValueError or SMTPException where it is not taken, SomeRefusedError where it is
+    taken for some recipients only.
+    """
     context = ssl.create_default_context()
     opened = (
         smtplib.SMTP_SSL(email.host, email.port, timeout=TIMEOUT_S, context=context)
@@ -86,4 +97,34 @@ def mail(email: Email, notices: Sequence[Notice]) -> None:
             server.starttls(context=context)
         if email.user:
             server.login(email.user, password_of(email))
-        server.send_message(message_of(email, notices))
+        try:
+            refused = server.send_message(message_of(email, notices))
+        except smtplib.SMTPRecipientsRefused as error:
+            raise OSError(f"no recipient is accepted: {_answers(error.recipients)}") from None
+    if refused:
+        raise SomeRefusedError(f"these recipients are not accepted, the others have it: {_answers(refused)}")
+
+
+def fault_of(error: Exception) -> str:
+    """In words why something was not sent."""
+    if isinstance(error, smtplib.SMTPResponseException):
+        return f"the server answers {_answer(error.smtp_code, error.smtp_error)}"
+    cause = error.reason if isinstance(error, URLError) else error
+    if isinstance(cause, ssl.SSLCertVerificationError):
+        return (
+            f"the certificate of the server is not accepted ({cause.verify_message}); if an authority of your own made "
+            "it, name the file of this authority in the environment variable SSL_CERT_FILE of the monitor"
+        )
+    return str(cause) or type(cause).__name__
+
+
+def _one_line(text: str) -> str:
+    return _CONTROL.sub("\ufffd", text)
+
+
+def _answer(code: int, words: bytes | str) -> str:
+    return _one_line(f"{code} {words.decode(errors='replace') if isinstance(words, bytes) else words}")
+
+
+def _answers(refused: Mapping[str, tuple[int, bytes]]) -> str:
+    return ", ".join(f"{address} ({_answer(*answer)})" for address, answer in refused.items())

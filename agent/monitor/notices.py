@@ -11,11 +11,12 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from http.client import HTTPException
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from cryptography.x509 import load_pem_x509_certificate
 
 from agent.monitor.fleet import Fleet
-from agent.monitor.messages import Notice, mail, post
+from agent.monitor.messages import Notice, SomeRefusedError, fault_of, mail, post
 from agent.monitor.settings import Notices
 
 LOOK_S = 1.0  # s between two looks at the fleet
@@ -91,10 +92,11 @@ class FleetWatch:
 
 class _Target:
     """A webhook or a mail server, and the notices that wait for it. Each message is sent in a thread of its own, so
-    that a server that never comes to an end delays no other one."""
+    that a server that never comes to an end delays no other one. `name`: of the target, for people.
+    """
 
-    def __init__(self, send: Callable[[Sequence[Notice]], None]) -> None:
-        self._send_to = send
+    def __init__(self, name: str, send: Callable[[Sequence[Notice]], None]) -> None:
+        self._name, self._send_to = name, send
         self._waiting: list[Notice] = []
         self._mutex = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -126,7 +128,7 @@ class _Target:
         """Why the last message was not sent; "" if it was, or is on its way."""
         late_s = time.monotonic() - self._began_s
         if self._thread is not None and self._thread.is_alive() and late_s > LATE_S:
-            return f"a notice could not be sent: the server has not come to an end for {late_s:.0f} s"
+            return self._unsent(f"the server has not come to an end for {late_s:.0f} s")
         return self._fault
 
     def _send(self) -> None:
@@ -134,13 +136,17 @@ class _Target:
             sending, self._waiting = self._waiting, []
         try:
             self._send_to(tuple(sending))
-        except (OSError, ValueError, HTTPException, smtplib.SMTPException) as error:
-            self._fault = f"a notice could not be sent: {error or type(error).__name__}"
+        except (OSError, ValueError, HTTPException, smtplib.SMTPException, SomeRefusedError) as error:
+            self._fault = self._unsent(fault_of(error))
             _log.warning("monitor: %s", self._fault)
-            with self._mutex:
-                self._waiting = (sending + self._waiting)[-WAITING_MAX:]
+            if not isinstance(error, SomeRefusedError):
+                with self._mutex:
+                    self._waiting = (sending + self._waiting)[-WAITING_MAX:]
         else:
             self._fault = ""
+
+    def _unsent(self, why: str) -> str:
+        return f"a notice could not be sent: {self._name}: {why}"
 
 
 class NoticeSender:
@@ -151,9 +157,9 @@ class NoticeSender:
 
     def __init__(self, watch: FleetWatch, settings: Notices) -> None:
         self._watch = watch
-        self._targets = [_Target(partial(post, url)) for url in settings.webhooks]
-        if settings.email is not None:
-            self._targets.append(_Target(partial(mail, settings.email)))
+        self._targets = [_Target(f"webhook at {urlsplit(url).netloc}", partial(post, url)) for url in settings.webhooks]
+        if (email := settings.email) is not None:
+            self._targets.append(_Target(f"mail server {email.host}:{email.port}", partial(mail, email)))
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="notices", daemon=True)
         self._thread.start()

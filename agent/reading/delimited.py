@@ -33,6 +33,8 @@ from agent.reading.dialect import (
     separates_thousands,
 )
 from agent.reading.lines import blocks, text_of
+from agent.reading.long_form import remedy_of
+from agent.reading.same_times import same_times, time_without_name
 from agent.reading.source import Array, Column, Progress, Source, TableError
 from calib.recorded.choice import names_time, words
 
@@ -57,6 +59,7 @@ class Delimited(Source):
         if len(set(named)) < len(named):
             raise TableError(f"{path}, {self.header}: a column is there twice, remove one: {','.join(names)!r}")
         self._parts = {Column(part.name, part.unit): part for part in self.dialect.parts}
+        self._look_at_times()
         self._count_rows()
         self.columns = tuple(self._parts)
         self._parse = _arrow_parser() or _numpy
@@ -70,6 +73,22 @@ class Delimited(Source):
 
     def _say(self, told: str) -> None:
         self.said = (*self.said, told)
+
+    def _look_at_times(self) -> None:
+        """Which columns tell the same times, and whether the rows hold one value each."""
+        dialect = self.dialect
+        first = enumerate(self._text.head[dialect.first_line - 1 :], start=dialect.first_line)
+        rows = [dialect.fields(line) for _, line in dialect.rows(first)]
+        rows = [row for row in rows if len(row) == len(dialect.header)]
+        self.remedy = remedy_of(dialect.header, rows)
+        if not dialect.names and (place := time_without_name(rows)) is not None:
+            time = replace(dialect.parts[place], unit="")  # a unit in the head is that of the channels
+            self._parts = {Column(time.name): time} | dict(list(self._parts.items())[place + 1 :])
+        finest, *others = same_times(dialect, rows) or (None,)
+        self.repeated = [column for column, part in self._parts.items() if part in others]
+        if finest is not None:
+            names = ", ".join(repr(part.name) for part in others)
+            self._say(f"{self.path}: column {finest.name!r} tells the same times as {names}, and is taken")
 
     def _count_rows(self) -> None:
         """Where the head states a rate, and no column is a time: a column of times from the count of the samples."""

@@ -231,12 +231,12 @@ def _usual_words(rows: Sequence[list[str]], enough: Callable[[Sequence[str]], bo
 
 def names_columns(fields: Sequence[str]) -> bool:
     """Whether a line has several words and no value."""
-    return len(_words_in(fields)) > 1 and not any(map(_is_value, fields))
+    return len(_words_in(fields)) > 1 and not any(map(is_number_or_moment, fields))
 
 
 def _words_in(fields: Sequence[str]) -> set[int]:
     """The fields that are neither values nor missing ones."""
-    return {k for k, field in enumerate(fields) if not _is_value(field) and field.lower() not in MISSING}
+    return {k for k, field in enumerate(fields) if not is_number_or_moment(field) and field.lower() not in MISSING}
 
 
 def _before(
@@ -248,7 +248,7 @@ def _before(
     before = [(n, named) for n, fields in above if (named := _named(fields, width)) is not None]
     if not before:
         before = _in_comment(lines, first_line, delimiter, width)
-    if not before and above and len(above[-1][1]) > 1 and not any(map(_is_value, above[-1][1])):
+    if not before and above and len(above[-1][1]) > 1 and not any(map(is_number_or_moment, above[-1][1])):
         before = [above[-1]]  # the rows have another number of fields, which their reader tells
         width = len(_stripped(before[0][1]))
     if before and len(before[-1][1]) != width and _is_counted(rows):
@@ -334,7 +334,7 @@ def _is_second(fields: Sequence[str], above: Sequence[str]) -> bool:
     if len(set(stated)) == 1 < len(stated):
         return True
     names = [f for f in above if f]
-    return len(set(stated)) < len(stated) <= len(names) == len(set(names)) and not any(map(_is_value, names))
+    return len(set(stated)) < len(stated) <= len(names) == len(set(names)) and not any(map(is_number_or_moment, names))
 
 
 def _in_comment(lines: Sequence[str], stop: int, delimiter: str, width: int) -> list[tuple[int, list[str]]]:
@@ -448,13 +448,13 @@ def _plain_number(text: str) -> float:
 
 
 def _all_values(fields: Sequence[str]) -> bool:
-    return _some_values(fields) and all(_is_value(f) or f.lower() in MISSING for f in fields)
+    return _some_values(fields) and all(is_number_or_moment(f) or f.lower() in MISSING for f in fields)
 
 
 def _some_values(fields: Sequence[str]) -> bool:
     """Whether there are two values, or one among fields in which a value is missing."""
-    values = sum(map(_is_value, fields))
-    rest = [f for f in fields if not _is_value(f)]
+    values = sum(map(is_number_or_moment, fields))
+    rest = [f for f in fields if not is_number_or_moment(f)]
     return values >= 2 or (values == 1 and any(rest) and all(f.lower() in MISSING for f in rest))
 
 
@@ -485,7 +485,8 @@ def _stripped(fields: list[str]) -> list[str]:
 
 
 @lru_cache(maxsize=1 << 13)
-def _is_value(text: str) -> bool:
+def is_number_or_moment(text: str) -> bool:
+    """Whether a cell is a number, a date, a time of day, or a word for a missing number."""
     plain = text.replace(",", ".")
     try:
         float(plain)
@@ -497,7 +498,7 @@ def _is_value(text: str) -> bool:
 
 def _comma(cells: Sequence[str]) -> str:
     """The first number with a comma, "" where there is none."""
-    return next((f for f in cells if "," in f and not is_moment(f) and _is_value(f)), "")
+    return next((f for f in cells if "," in f and not is_moment(f) and is_number_or_moment(f)), "")
 
 
 def separates_thousands(cells: Sequence[str]) -> bool:

@@ -52,6 +52,9 @@ FORMATS = (
     Format("TDMS", (".tdms",), (b"TDSm",), "agent.reading.tdms:open_tdms", "tdms"),
 )
 BAGS = FORMATS[:3]
+FIELDS = rb"[^\s,=]+=[^\s,=]+(?:,[^\s,=]+=[^\s,=]+)*"
+# The measurement with its tags, the fields, and the time in ns; comments before it.
+LINE_PROTOCOL = rb"(?:#[^\n]*\n)*[^\s,=#]+(?:," + FIELDS + rb")? " + FIELDS + rb" -?\d{9,20}\r?\n"
 ONE_CHANNEL = "its lines hold one channel: write time, x, y and z as columns of a CSV"
 FIRST_PART = rb"(?s)PK\x03\x04.{26}"  # of a zip archive; its name follows
 # What is not read: how such a file begins, what it is, and what to do with it.
@@ -72,6 +75,11 @@ NOT_READ = (
     (rb" {0,4}-1 *\r?\n +\d+", "UFF58, the universal file format", "write it as CSV"),
     (rb"TIMESERIES \S+,", "the text of a seismic archive (SLIST or TSPAIR)", "fetch the same data as MiniSEED"),
     (rb"Origin Time +\d", "a record of K-NET or KiK-net", ONE_CHANNEL),
+    (
+        LINE_PROTOCOL,
+        "the line protocol of InfluxDB",
+        "write a CSV with a column for each field (`influx -format csv`, or in Flux `|> pivot(...)`)",
+    ),
     (rb"PEER ", "a record of PEER (AT2)", ONE_CHANNEL),
     (rb"(?:Uncorrected|Corrected) [^\n]{0,40}\(Format v", "a record in the format of COSMOS", ONE_CHANNEL),
     (rb"EVENT_NAME: ", "a record of ESM or ITACA (DYNA)", ONE_CHANNEL),

@@ -36,7 +36,9 @@ class Source(ABC):
 
     `said`: what was guessed or left out of the file and of the columns that were read last, for the user. `rate_hz`: as
     the file states it. `counted`: name of a column that counts samples at this rate. `filters`: the known filters of
-    its devices, by group, each in one line of text (calib.signal.known_filters).
+    its devices, by group, each in one line of text (calib.signal.known_filters). `repeated`: columns of times that
+    another column tells too, at least as finely. `remedy`: what to do where the columns are not those that are needed,
+    "" where the file does not tell it.
     """
 
     path: Path
@@ -45,6 +47,8 @@ class Source(ABC):
     said: Sequence[str] = ()
     rate_hz: float | None = None
     counted = ""
+    repeated: Sequence[Column] = ()
+    remedy = ""
     filters: Mapping[str, tuple[str, ...]] = MappingProxyType({})
 
     @abstractmethod

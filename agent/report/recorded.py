@@ -18,7 +18,7 @@ from agent.core.schedule import pieces
 from agent.core.snapshot import unpack
 from agent.core.stream import DeviceStream
 from agent.core.windows import margin_of
-from agent.recording.in_order import OrderError, in_order
+from agent.recording.in_order import OrderError, of_one_gateway
 from agent.recording.reading import RecordingReader
 from agent.recording.records import FileFault
 from agent.report.trace import Trace
@@ -62,9 +62,11 @@ def sensors_of(path: Path) -> list[str]:
 def in_order_of(paths: Sequence[Path]) -> list[Path]:
     """Recordings of one gateway, the oldest first. Raises RecordingError."""
     try:
-        return in_order([(path, _start(path)) for path in paths])
+        return of_one_gateway([(path, _start(path)) for path in paths])
     except OrderError as error:
         raise RecordingError(str(error)) from None
+    except OSError as error:
+        raise RecordingError(f"{error.filename}: {error.strerror}") from None
 
 
 def read_recordings(paths: list[Path], sensor: str) -> RecordedSensor:

@@ -13,6 +13,8 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from agent.config.whole_files import whole_file, write_whole
+
 WIDTH_IN = 5.0  # 480 px: on a phone of 360 px the 10 pt letters are still 9 px high
 ABOVE: Any = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}  # of a legend, over the axes
 INK, PALE, PAPER = "#1b1e23", "#c9ced6", "#ffffff"
@@ -72,9 +74,11 @@ def figure(height_in: float) -> Figure:
 def save(drawn: Figure, directory: Path, name: str) -> str:
     """Write NAME.svg, .png and .pdf; gives the SVG for the page, with its own ids. Raises OSError."""
     text = svg(drawn)
-    (directory / f"{name}.svg").write_text(text, encoding="utf-8")
-    drawn.savefig(directory / f"{name}.png", dpi=160)
-    drawn.savefig(directory / f"{name}.pdf", metadata={"CreationDate": None})
+    write_whole(directory / f"{name}.svg", text.encode())
+    with whole_file(directory / f"{name}.png") as file:
+        drawn.savefig(file, format="png", dpi=160)
+    with whole_file(directory / f"{name}.pdf") as file:
+        drawn.savefig(file, format="pdf", metadata={"CreationDate": None})
     return _inline(text, name)
 
 

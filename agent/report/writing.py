@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from agent import __version__
+from agent.config.whole_files import write_together
 from agent.delivery.history import StoredResult
 from agent.report.figures import draw
 from agent.report.material import Material
@@ -21,9 +22,8 @@ def write(material: Material, output: Path) -> None:
     """Write report.html, report.json and figures/ into `output`, which is created if needed. Raises OSError."""
     seen = left_over(material)
     figures = draw(material, seen[-1] if seen else None, output / "figures")
-    (output / "report.html").write_text(page(material, figures, seen), encoding="utf-8")
     held = msgspec.json.format(msgspec.json.encode(as_object(material, seen, [drawn.name for drawn in figures])))
-    (output / "report.json").write_bytes(held + b"\n")
+    write_together(output, {"report.html": page(material, figures, seen).encode(), "report.json": held + b"\n"})
 
 
 def left_over(material: Material) -> list[Residuals]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -114,6 +115,8 @@ def _copy_store(source: Path, target: Path) -> None:
                 with write:
                     write_mark(write, "clean", 0)
     except sqlite3.Error as error:
+        if error.sqlite_errorname in ("SQLITE_FULL", "SQLITE_IOERR_WRITE"):
+            raise OSError(errno.ENOSPC, f"the copy of the store cannot be written: {error}", str(target)) from None
         raise BackupError(f"{source}: {error}; start the agent once, which repairs its store") from None
     if verdict != "ok":
         raise BackupError(f"{source}: damaged: {verdict}; start the agent once, which repairs its store")

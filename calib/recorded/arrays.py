@@ -37,7 +37,8 @@ class _Frame:
 
     def __init__(self, place: str, columns: Mapping[Any, Any]) -> None:
         dated = {name: _filled(values).dtype.kind in "Mm" for name, values in columns.items()}
-        self.path, self.header = place, ""
+        self.path, self.header, self.remedy = place, "", ""
+        self.repeated: Sequence[Column] = ()
         self.columns: Sequence[Column] = [Column(str(name), "s" if is_date else "") for name, is_date in dated.items()]
 
 

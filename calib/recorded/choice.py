@@ -11,7 +11,7 @@ from string import ascii_lowercase
 from typing import Any, Protocol, TypeVar
 
 from calib.recorded.errors import InputError
-from calib.recorded.units import UNITS, split, unit_of
+from calib.recorded.units import G_FORCE, UNITS, split, unit_of
 
 TIME_WORDS = frozenset(
     ["time", "timestamp", "t", "datetime", "date", "epoch", "stamp", "utc", "zeit", "temps", "seconds", "secs"]
@@ -62,11 +62,15 @@ class Column:
 
 
 class NamedColumns(Protocol):
-    """What has named columns: a file, or a table in memory. `header`: where it names them, for messages."""
+    """What has named columns: a file, or a table in memory. `header`: where it names them, for messages. `repeated`:
+    columns of times that another column tells too. `remedy`: what to do where other columns are needed, "" for what is
+    always said."""
 
     path: Any
     columns: Sequence[Column]
     header: str
+    repeated: Sequence[Column]
+    remedy: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +140,7 @@ class Choice:
         """An error that says what was seen and how to say it."""
         seen = ",".join(str(c) for c in self._source.columns[:24])
         more = ",..." if len(self._source.columns) > 24 else ""
-        remedy = (
+        remedy = self._source.remedy or (
             f"say which columns to use: {self._option} time=NAME,x=NAME,... (a unit may follow a name: x=NAME:mg)"
             if self._option else "rename the columns; a unit may stand in a name: 'x [mg]'"
         )  # fmt: skip
@@ -204,6 +208,8 @@ class Choice:
         East, north and up are x, y and z where all three are there.
         """
         found = [self._compass[role]] if role in self._compass else [c for c in self._columns if _role(c) == role]
+        if role == "time" and len(found) > 1:
+            found = [c for c in found if c not in self._source.repeated]
         if len(found) > 1:
             raise self.fault(f"several columns could be {role}: {', '.join(repr(str(c)) for c in found)}")
         if found and role == "time":
@@ -234,6 +240,15 @@ class Choice:
             ChosenColumn(c, _unit(c)) for c in self._columns
             if c not in columns and _role(c) not in ("time", "temperature") and (not group or c.group in group)
         ]  # fmt: skip
+
+    def unnamed_time(self) -> ChosenColumn | None:
+        """The first column where no column has a name, and one or three stand behind it. None where that is not so."""
+        unnamed = not self.is_stated and all(c.name.isdigit() for c in self._columns)
+        return (
+            ChosenColumn(self._columns[0], _unit(self._columns[0]))
+            if unnamed and len(self._columns) in (2, 4)
+            else None
+        )
 
     def in_their_order(self, three: Sequence[ChosenColumn]) -> Sequence[ChosenColumn]:
         """The three columns as x, y and z. Raises InputError where their names tell another order."""
@@ -308,6 +323,6 @@ def _role(column: Column) -> str:
         return "temperature"
     if not told or any(_OTHER_AXES.match(word) for word in told):
         return ""
-    if found := _AXIS.fullmatch(told[-1]) or (told[0] in AXES and _AXIS.fullmatch(told[0])):
-        return found[1]
-    return ""
+    found = G_FORCE.fullmatch(column.name) or _AXIS.fullmatch(told[-1])
+    found = found or (_AXIS.fullmatch(told[0]) if told[0] in AXES else None)
+    return found[1].lower() if found else ""

@@ -44,7 +44,7 @@ def _with_unnamed(choice: Choice, known: dict[str, ChosenColumn]) -> dict[str, C
     rest = choice.rest(list(known.values()))
     if list(known) == ["time"] and len(rest) == len(AXES):
         return known | dict(zip(AXES, choice.in_their_order(rest), strict=True))
-    if not known and len(rest) == 4 and all(c.column.name.isdigit() for c in rest):
+    if not known and len(rest) == 4 and choice.unnamed_time():
         return dict(zip(("time", *AXES), rest, strict=True))
     return known
 
@@ -98,7 +98,7 @@ def reference_columns(choice: Choice, sensitivity: Sensitivity | None) -> tuple[
         columns, quantity = standard
         check_units(choice, columns[1:], else_si=True)
         return columns, sensitivity.quantity if sensitivity else quantity
-    time = choice.stated("time") or choice.guessed("time")
+    time = choice.stated("time") or choice.guessed("time") or choice.unnamed_time()
     stated_as, channels = _channels(choice, time)
     if not time or len(channels) not in (1, 3):
         raise choice.fault("expected exactly one of time and one channel, or time and x, y and z,")

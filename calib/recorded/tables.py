@@ -331,7 +331,12 @@ def _check_overlap(sensor: SensorTable, reference: ReferenceTable | None, poses:
 
 def _zone(spans: Sequence[tuple[str, float, float]]) -> str:
     """A hint where all times are dates; they may be those of different zones."""
-    return "; a date without a zone is taken as UTC" if min(start for _, start, _ in spans) > FIRST_DATE_S else ""
+    if min(start for _, start, _ in spans) <= FIRST_DATE_S:
+        return ""
+    return (
+        "; a date without a zone is taken as UTC: where it is local time, write its offset behind the name of its "
+        "column, as 'Time UTC+02:00'"
+    )
 
 
 def _interpolated(at_s: Array, time_s: Array, values: Array) -> Array:

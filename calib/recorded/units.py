@@ -101,6 +101,7 @@ def unit_name(text: str) -> str:
 
 _BRACKETS = re.compile(r"(?P<base>.*?)[\s_]*[\[(](?P<unit>[^\])]*(?:\([^()]*\))?)[\])]\s*")
 _SUFFIX = re.compile(r"(?P<base>.+)[_ ](?P<unit>[A-Za-z0-9]+)")
+G_FORCE = re.compile(r"g[ _-]?f(?:orce)?[ _-]?([xyz])", re.IGNORECASE)  # an acceleration in g along an axis: gFx
 
 
 def split(name: str) -> tuple[str, str]:
@@ -109,7 +110,7 @@ def split(name: str) -> tuple[str, str]:
         return found["base"], found["unit"]
     if (found := _SUFFIX.fullmatch(name)) and found["unit"].lower() in SUFFIXES:
         return found["base"], found["unit"]
-    return name, ""
+    return (name, "g") if G_FORCE.fullmatch(name) else (name, "")
 
 
 def unknown_unit(name: str, unit: str) -> str:

@@ -15,6 +15,7 @@ import pytest
 from agent.core.events import DriftReport, Result
 from agent.delivery.keys import Address
 from agent.delivery.received import Received
+from calib.rounding import plus_minus
 from tests.unit.browser import Watched, chromium, needs_chromium
 from tests.unit.results import calibration, status, window
 from tests.unit.test_docs_commands import unknown
@@ -187,6 +188,20 @@ def keep(served: Served, sensor: str, *results: Result) -> None:
 def browser() -> Iterator[Any]:
     with chromium() as opened:
         yield opened
+
+
+ROUNDED = """async (values) => {
+    const { plusMinus } = await import('./format.js');
+    return values.map((one) => plusMinus(...one));
+}"""
+
+
+def test_the_page_rounds_as_every_other_text_does(site: Site, tmp_path: Path, browser: Any) -> None:
+    sizes, U = (98765.4, 5.1, 0.012342), (1234.0, 99.6, 12.3, 0.0999, 4e-5)
+    values = [(sign * size, expanded) for sign in (1.0, -1.0) for size in sizes for expanded in U]
+    with Served(site, tmp_path / "monitor") as served:
+        told = Watched(browser, served.address).open().evaluate(ROUNDED, values)
+    assert told == [plus_minus(*one).replace("-", "\N{MINUS SIGN}") for one in values]
 
 
 def test_each_kind_of_sensor_says_what_it_is_and_whether_its_values_may_be_used(

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
+import smtplib
 import socket
+import ssl
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from email import message_from_bytes
+from email.utils import parsedate_to_datetime
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from urllib.error import URLError
 
 import pytest
 
@@ -18,7 +23,7 @@ from agent.config.reading import ConfigError
 from agent.keys.certificates import make_authority
 from agent.monitor import notices as notices_module
 from agent.monitor.fleet import Fleet
-from agent.monitor.messages import Notice, mail, message_of, post
+from agent.monitor.messages import Notice, fault_of, mail, message_of, post
 from agent.monitor.notices import FleetWatch, NoticeSender
 from agent.monitor.settings import Email, Notices, load_settings
 from tests.unit.zenoh_site import wait_for
@@ -199,8 +204,8 @@ def test_a_server_that_answers_badly_or_never_delays_no_other(monkeypatch: pytes
     assert json.loads(good.taken[1])["text"] == "site/gw/mems: HELD: second"
 
 
-def serve_mail(listening: socket.socket, taken: list[bytes]) -> None:
-    """One session of a mail server that takes everything."""
+def serve_mail(listening: socket.socket, taken: list[bytes], unknown: bytes = b"nobody") -> None:
+    """One session of a mail server that takes everything, but for one user."""
     connection, _ = listening.accept()
     with connection, connection.makefile("rb") as lines:
         connection.sendall(b"220 test\r\n")
@@ -209,21 +214,37 @@ def serve_mail(listening: socket.socket, taken: list[bytes]) -> None:
                 connection.sendall(b"354 go on\r\n")
                 while (part := lines.readline()) != b".\r\n":
                     taken.append(part)
-            connection.sendall(b"221 bye\r\n" if line.upper().startswith(b"QUIT") else b"250 ok\r\n")
+            answer = b"550 no such user" if line.startswith(b"rcpt TO:<" + unknown) else b"250 ok"
+            connection.sendall((b"221 bye" if line.upper().startswith(b"QUIT") else answer) + b"\r\n")
+
+
+@contextmanager
+def mail_server(sessions: int = 1) -> Iterator[tuple[Callable[..., Email], list[bytes]]]:
+    """A mail server. Yields what makes its settings for recipients, and the lines that it has taken."""
+    taken: list[bytes] = []
+
+    def serve() -> None:
+        for _ in range(sessions):
+            serve_mail(listening, taken)
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port, server = listening.getsockname()[1], threading.Thread(target=serve, daemon=True)
+        server.start()
+        yield lambda *recipients: Email(host="127.0.0.1", port=port, security="none",
+                                        sender="fieldcal@example.org", recipients=recipients), taken  # fmt: skip
+        server.join(5)
 
 
 def test_a_mail_has_the_texts_of_the_bus_in_its_body_alone() -> None:
-    taken: list[bytes] = []
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        server = threading.Thread(target=serve_mail, args=(listening, taken), daemon=True)
-        server.start()
-        email = Email(host="127.0.0.1", port=listening.getsockname()[1], security="none",
-                      sender="fieldcal@example.org", recipients=("a@example.org", "b@example.org"))  # fmt: skip
-        mail(email, [BAD, BAD])
-        server.join(5)
+    before = datetime.now(UTC).replace(microsecond=0)
+    with mail_server() as (email, taken):
+        mail(email("a@example.org", "b@example.org"), [BAD, BAD])
     message = message_from_bytes(b"".join(taken))
     assert {name.lower() for name in message.keys()} == {  # noqa: SIM118 - a message gives no names by iteration
-        "subject", "from", "to", "content-type", "content-transfer-encoding", "mime-version"}  # fmt: skip
+        "subject", "from", "to", "date", "message-id", "auto-submitted", "content-type", "content-transfer-encoding",
+        "mime-version"}  # fmt: skip
+    assert before <= parsedate_to_datetime(message["Date"]) <= datetime.now(UTC)
+    assert re.fullmatch(r"<[^@\s]+@example\.org>", message["Message-ID"])
     assert message["Subject"] == "fieldcal: 2 notices, status of site/gw/mems"
     assert message["To"] == "a@example.org, b@example.org"
     body = message.get_payload(decode=True)
@@ -232,8 +253,65 @@ def test_a_mail_has_the_texts_of_the_bus_in_its_body_alone() -> None:
         body.decode().splitlines()
         == ["site/gw/mems: HELD: x\ufffd\ufffdBcc: all@example.org\ufffd\ufffd\ufffd\ufffdbody"] * 2
     )
-    with pytest.raises(ValueError, match="linefeed"):
-        message_of(email, [Notice("status", "a\r\nBcc: all@example.org", "")])
+    named = message_of(email("a@example.org"), [Notice("status", "a\r\nBcc: all@example.org", "")])
+    assert named["Subject"] == "fieldcal: 1 notice, status of a\ufffd\ufffdBcc: all@example.org"
+    assert "bcc" not in named
+
+
+def test_a_recipient_that_is_refused_is_told_and_the_others_get_a_mail_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(notices_module, "LOOK_S", 0.01)
+    monkeypatch.setattr(notices_module, "APART_S", 0.05)
+    fleet = Fleet()
+    with mail_server(2) as (email, taken):
+        settings = Notices(email=email("a@example.org", "nobody@example.org"))
+        notifier = NoticeSender(FleetWatch(fleet, settings, []), settings)
+        fleet.take(*PLACE, "status", held("first"))
+        wait_for(lambda: notifier.fault != "")
+        assert notifier.fault.startswith("a notice could not be sent: mail server 127.0.0.1:")
+        assert notifier.fault.endswith("others have it: nobody@example.org (550 no such user)")
+        fleet.take(*PLACE, "status", held("second"))
+        wait_for(lambda: len([line for line in taken if b"HELD" in line]) > 1)
+        notifier.close()
+    assert [line.split()[-1] for line in taken if b"HELD" in line] == [b"first", b"second"]
+
+
+def test_a_mail_that_nobody_gets_is_a_fault() -> None:
+    with (
+        mail_server() as (email, _),
+        pytest.raises(OSError, match=r"no recipient is accepted: nobody@example\.org \(550 no such user\)"),
+    ):
+        mail(email("nobody@example.org"), [BAD])
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (smtplib.SMTPAuthenticationError(535, b"5.7.8 no\r\nway"), "the server answers 535 5.7.8 no\ufffd\ufffdway"),
+        (URLError(ConnectionRefusedError(111, "Connection refused")), "[Errno 111] Connection refused"),
+        (TimeoutError(), "TimeoutError"),
+    ],
+)
+def test_why_a_notice_was_not_sent_is_said_in_words(error: Exception, words: str) -> None:
+    assert fault_of(error) == words
+
+
+def test_a_server_with_a_certificate_of_its_own_is_told_with_the_remedy(tmp_path: Path) -> None:
+    authority, ends = make_authority("mail", 40, datetime.now(UTC)), tmp_path / "mail.pem"
+    ends.write_bytes(authority.key_pem + authority.certificate_pem)
+    served = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    served.load_cert_chain(ends)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def serve() -> None:
+            with suppress(ssl.SSLError):
+                served.wrap_socket(listening.accept()[0], server_side=True)
+
+        threading.Thread(target=serve, daemon=True).start()
+        with pytest.raises(URLError) as refused:
+            post(f"https://127.0.0.1:{listening.getsockname()[1]}/", [BAD])
+    assert re.search(r"not accepted \(.+\); .+SSL_CERT_FILE", fault_of(refused.value))
 
 
 @pytest.mark.parametrize(

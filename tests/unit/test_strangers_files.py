@@ -342,3 +342,30 @@ def test_a_time_of_several_columns_names_them(tmp_path: Path) -> None:
     path = tmp_path / "s.csv"
     path.write_text("secs,nsecs,x,y,z\n" + "".join(f"1700000000,{k}00000000,1,2,3\n" for k in range(9)))
     assert any("column 'secs' is the sum of 'secs' and 'nsecs'" in line for line in read_sensor(path).said)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["acc,site=bridge x=0.1,y=0.2,z=9.8 1711376533000000000", "# export\nacc x=0.1,y=0.2,z=9.8 1711376533000000000"],
+)
+def test_the_line_protocol_of_influxdb_is_named(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.lp"
+    path.write_text(f"{line}\n" * 9)
+    with pytest.raises(TableError, match="the line protocol of InfluxDB, which is not read; write a CSV with a column"):
+        read_sensor(path)
+
+
+def test_times_that_differ_are_not_taken_for_the_same(tmp_path: Path) -> None:
+    """The arrival is up to 40 ms later than the sample, which has ms."""
+    path, late_s = tmp_path / "a.csv", np.random.default_rng(1).uniform(0.0, 0.04, 400)
+    rows = (f"{k / 100:.3f},{k / 100 + late:.3f},{k},{k},{k}\n" for k, late in enumerate(late_s))
+    path.write_text("time,timestamp,x,y,z\n" + "".join(rows))
+    with pytest.raises(TableError, match="several columns could be time: 'time', 'timestamp'"):
+        read_sensor(path)
+
+
+def test_the_unit_of_the_channels_is_not_that_of_times_without_a_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("Unit: mV\n" + "".join(f"{k / 100:.2f},{k},2,3\n" for k in range(40)))
+    found = read_sensor(path)
+    assert (found.unit, found.time_s[:].tolist()[3], found.v[:].tolist()[3]) == ("mV", 0.03, [3.0, 2.0, 3.0])

@@ -106,7 +106,10 @@ def test_times_of_two_zones_are_told_as_dates(tmp_path: Path) -> None:
     status, _, said = run(tmp_path, table("time,x,y,z", local, V), table("time,x,y,z", utc, a))
     assert status == 2
     assert "sensor.csv from 2026-03-29 00:59:40.000 to 2026-03-29 01:00:19.990" in said
-    assert said.endswith("a date without a zone is taken as UTC")
+    assert "a date without a zone is taken as UTC: where it is local time, write its offset" in said
+    assert said.endswith("as 'Time UTC+02:00'")
+    named = table("time UTC+01:00,x,y,z", local, V)
+    right(*run(tmp_path, named, table("time,x,y,z", utc, a)))
 
 
 def test_times_that_fall_are_refused(tmp_path: Path) -> None:

@@ -8,19 +8,19 @@ export const DAY_NS = 86400e9;
 export const finite = (v) => typeof v === "number" && Number.isFinite(v);
 const minus = (string) => string.replace(/^-(?=0(\.0*)?$)/, "").replace("-", "\u2212");
 
-// Digits behind the point that show two digits of U.
-const decimals = (U) => Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(U))));
-const fixed = (v, n) => (Math.abs(v) < 1e15 ? v.toFixed(n) : v.toExponential(2));
+// Digits behind the point that show two digits of U; below 0: tens, hundreds, ...
+const decimals = (U) => Math.min(12, 1 - Number(U.toExponential(1).split("e")[1]));
+const whole = (v, n) => (n < 0 ? Math.round(v / 10 ** -n) * 10 ** -n : v);
+const fixed = (v, n) => (Math.abs(v) < 1e15 ? whole(v, n).toFixed(Math.max(0, n)) : v.toExponential(2));
 export const rounded = (v, U) => (finite(v) ? minus(finite(U) && U > 0 ? fixed(v, decimals(U)) : Number(v.toPrecision(4)).toString()) : "not known");
-export const signed = (v, U) => (finite(v) && Number(v.toFixed(finite(U) && U > 0 ? decimals(U) : 12)) > 0 ? `+${rounded(v, U)}` : rounded(v, U));
+export const signed = (v, U) => (finite(v) && Number(fixed(v, finite(U) && U > 0 ? decimals(U) : 12)) > 0 ? `+${rounded(v, U)}` : rounded(v, U));
 // Two digits that count; all digits before the point.
 export function two(v) {
   if (!finite(v)) return "not known";
-  const r = Math.abs(v) < 10 ? Number(v.toPrecision(2)) : v;
-  return minus(r === 0 ? "0" : fixed(r, decimals(Math.abs(r))));
+  return minus(v === 0 ? "0" : fixed(v, Math.max(0, decimals(Math.abs(v)))));
 }
 // `value ± U`, both to the second digit of U.
-export const plusMinus = (v, U) => (!finite(v) ? "not known" : finite(U) && U > 0 ? `${rounded(v, U)} ± ${two(U)}` : rounded(v));
+export const plusMinus = (v, U) => (!finite(v) ? "not known" : finite(U) && U > 0 ? `${rounded(v, U)} ± ${rounded(U, U)}` : rounded(v));
 export const short = (v) => (finite(v) ? minus(Number(v.toPrecision(5)).toString()) : "not known");
 export const band = (hz) => (hz?.length === 2 ? `${two(hz[0])} – ${two(hz[1])} Hz` : "");
 

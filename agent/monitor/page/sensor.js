@@ -107,7 +107,7 @@ function showMatrix(newest, row, trends) {
     const U = coverageFactor(newest) * newest.standard_uncertainty[i], change = trends.changes?.[i], over = change && finite(change.change) && change.U > 0 ? `${(Math.abs(change.change) / change.U).toFixed(1)} U` : "", silent = over && Math.abs(change.change) > change.U && !moved.has(NAMES[i]);
     const known = newest.determined[i] ? [] : [make("small", "by the prior")];
     const stays = moved.has(NAMES[i]) && (row.status === "HELD" || over === "0.0 U"); // windows tell a change, and S in force stays
-    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${two(U)}` : "U not known"), ...(stays ? [make("small", "not in force")] : over ? [make("small", `moved ${over}${silent ? `, ${unjudged(trends)[0]}` : ""}`, silent ? { title: unjudged(trends)[1] } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
+    return make("td", [rounded(value(newest, i), U), make("small", finite(U) ? `± ${rounded(U, U)}` : "U not known"), ...(stays ? [make("small", "not in force")] : over ? [make("small", `moved ${over}${silent ? `, ${unjudged(trends)[0]}` : ""}`, silent ? { title: unjudged(trends)[1] } : {})] : []), ...known], { class: moved.has(NAMES[i]) ? "moved" : "", title: NAMES[i] });
   };
   const rows = AXES.map((axis, r) => make("tr", [make("th", axis, { scope: "row" }), cell(3 * r), cell(3 * r + 1), cell(3 * r + 2)]));
   const head = make("tr", [make("th", "output", { scope: "col" }), ...AXES.map((axis) => make("th", `along ${axis}`, { scope: "col" }))]);

@@ -5,7 +5,7 @@ import { card, copier } from "./parts.js";
 
 const TOLD_PCT = 100, DEG = 180 / Math.PI, K = 2;
 const when = (s) => [make("b", s.since), s.earliest !== s.since || s.latest !== s.since ? ` (between ${s.earliest} and ${s.latest})` : ""];
-const sized = (s) => (s.turn ? `${rounded(Math.abs(DEG * s.size), DEG * s.expanded_uncertainty)}° (± ${two(DEG * s.expanded_uncertainty)}°)` : `${rounded(Math.abs(TOLD_PCT * s.size), TOLD_PCT * s.expanded_uncertainty)} % (± ${two(TOLD_PCT * s.expanded_uncertainty)} %)`);
+const sized = (s) => (s.turn ? `${rounded(Math.abs(DEG * s.size), DEG * s.expanded_uncertainty)}° (± ${rounded(DEG * s.expanded_uncertainty, DEG * s.expanded_uncertainty)}°)` : `${rounded(Math.abs(TOLD_PCT * s.size), TOLD_PCT * s.expanded_uncertainty)} % (± ${rounded(TOLD_PCT * s.expanded_uncertainty, TOLD_PCT * s.expanded_uncertainty)} %)`);
 const ofAxes = (axes) => (axes === "xyz" ? "x, y and z" : axes);
 
 function witness(w, turn) {

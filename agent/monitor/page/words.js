@@ -21,7 +21,7 @@ const spread = (days) => (finite(days) ? ` (± ${duration(2 * days * DAY_NS)})` 
 
 // A size with its U. Where U is larger, the change is found all the same (by the verdict), so it has this direction.
 function pair(v, U, unit) {
-  const size = Math.abs(v), range = U > size ? `0 to ${rounded(size + U, U)}` : `± ${two(U)}`;
+  const size = Math.abs(v), range = U > size ? `0 to ${rounded(size + U, U)}` : `± ${rounded(U, U)}`;
   return [make("b", `${rounded(size, U)}${unit}`), finite(U) ? ` (${range}${unit})` : ""];
 }
 
@@ -88,7 +88,7 @@ export function covered(row, trends) {
 function often(row, trends) {
   const [verdict] = row.verdicts, { size, u_size, unit, factor } = finding(verdict, trends?.found?.[verdict.parameter]), years = 1 / verdict.false_alarms_a_year, U = 2 * u_size * factor;
   const told = finite(years) && years > 0 ? `A sound sensor gives such a false alarm once in ${two(years)} years at most. ` : "";
-  return U > Math.abs(size * factor) ? `${told}How far it has changed is less sure: U of the change is ± ${two(U)}${unit}. ` : told;
+  return U > Math.abs(size * factor) ? `${told}How far it has changed is less sure: U of the change is ± ${rounded(U, U)}${unit}. ` : told;
 }
 
 function steady(row) {
@@ -163,7 +163,7 @@ function heldWords(row, verdicts, trends) {
 // What is said of a sensor that is in order: its largest change of a main sensitivity, and what was adopted.
 function soundWords(row, trends) {
   const most = largest(trends), adopted = trends?.adopted_utc_ns ? [" A jump was adopted on ", day(trends.adopted_utc_ns), "; U has been larger since."] : [];
-  const change = most ? [` Its largest change since ${trends.accepted ? "the accepted" : "the first"} calibration is that of `, symbol(most.name), `: ${signed(most.pct, most.U)} % (± ${two(most.U)} %)`, most.over > 1 ? `, ${unjudged(trends)[1]}.` : "."] : [];
+  const change = most ? [` Its largest change since ${trends.accepted ? "the accepted" : "the first"} calibration is that of `, symbol(most.name), `: ${signed(most.pct, most.U)} % (± ${rounded(most.U, most.U)} %)`, most.over > 1 ? `, ${unjudged(trends)[1]}.` : "."] : [];
   return { say: ["No drift and no step is found.", ...adopted], more: [...change, trends?.beside?.count ? ` ${trends.beside.count} other sensors have the same reference.` : ""] };
 }
 
