@@ -19,8 +19,9 @@ from calib.estimate.response_told import LEFT_U, ResponseTold
 from calib.excitation.lag_search import largest_omega, without_lag
 from calib.excitation.windows import rests_anywhere
 from calib.geometry import AXES, STANDARD_GRAVITY_MPS2
-from calib.model import PARAMETERS, Array, Window
+from calib.model import PARAMETERS, Array, Calibration, Window
 from calib.recorded.certificate import ReferenceCertificate
+from calib.recorded.halves import ChangeWithin, change_within
 from calib.recorded.measurement_result import NuisanceValue
 from calib.recorded.narrower import Band, band_below_gap, narrower_bands
 from calib.recorded.options import Options
@@ -42,6 +43,7 @@ LAG_SD, LAG_PERIODS = 3.0, 3.0  # how far a lag is searched: stated standard unc
 MOST_PHASE_RAD = 0.1  # SD between windows of one frequency: S is smaller by half of its square
 LEAST_USED = 0.05  # of the points in motion
 MAIN = [0, 4, 8]  # of PARAMETERS
+CHANGE = "change within the recording"  # of the budget
 HALF_OCTAVE = 2.0**0.5
 RESPONSE_TURNS = 6
 BETTER = 1.25  # times: largest u of the main sensitivities from rests alone over that from all windows
@@ -92,12 +94,25 @@ def adjusted(
         outcome = replace(outcome, warnings=(_offset_warning(offset_s),))
     if found is not None and found.across.motion:
         outcome = replace(outcome, warnings=(*outcome.warnings, _across_warning(found.across, priors.transverse)))
+    if found is not None and outcome.calibration is not None and (change := change_within(found)) is not None:
+        outcome = _with_change(outcome, outcome.calibration, change)
     if found is None or (share := found.share) is None:
         return outcome
     if certificate is not None:
         share = replace(share, sensitivity=certificate.sensitivity)
     identity = ("", "") if certificate is None else (certificate.serial_number, certificate.sha256)
     return replace(outcome, more={**outcome.more, "shared_errors": [share.as_object(*identity)]})
+
+
+def _with_change(outcome: Outcome, calibration: Calibration, change: ChangeWithin) -> Outcome:
+    """The outcome with a warning, and with half of the change of S in its uncertainty."""
+    covariance, half = calibration.covariance.copy(), np.append(change.half, np.zeros(3))
+    covariance += np.outer(half, half)
+    sources = {**outcome.more["budget"], CHANGE: dict(zip(PARAMETERS, np.abs(half).tolist(), strict=True))}
+    return replace(
+        outcome, calibration=replace(calibration, covariance=covariance), warnings=(*outcome.warnings, change.words),
+        more={**outcome.more, "budget": sources},
+    )  # fmt: skip
 
 
 def _offset_warning(offset_s: float) -> str:

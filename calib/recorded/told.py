@@ -35,6 +35,7 @@ _WAYS = {
     "response by axis": _FILTERS,
     "response over frequency": _FILTERS,
     "lag": "motion at more frequencies, or a delay in `sensor_filter`",
+    "change within the recording": "the parts calibrated by themselves",
     "prior of S and Q": "motion in more directions, or a better `prior`",
 }
 
