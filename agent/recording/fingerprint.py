@@ -10,12 +10,17 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 # Not public names of numpy; numpy.show_runtime reads the same ones.
 from numpy._core._multiarray_umath import __cpu_dispatch__ as _dispatched  # type: ignore[import-not-found]
 from numpy._core._multiarray_umath import __cpu_features__ as _features
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 CORE_TYPE = "OPENBLAS_CORETYPE"
 DISABLED_FEATURES = "NPY_DISABLE_CPU_FEATURES"
@@ -78,12 +83,18 @@ def _blas() -> dict[str, str]:
 
     scipy's own BLAS chooses the same kernel, but is loaded later.
     """
-    from threadpoolctl import threadpool_info
-
-    libraries = [info for info in threadpool_info() if info["user_api"] == "blas"]
+    libraries = [info for info in _loaded().info() if info["user_api"] == "blas"]
     own = [info for info in libraries if "numpy" in info["filepath"]] or libraries
     return {
         "blas": " ".join(sorted(f"{info['internal_api']} {info['version']}" for info in own)),
         "blas_kernel": " ".join(sorted(str(info.get("architecture", "")) for info in own)),
         "blas_threads": " ".join(sorted(str(info["num_threads"]) for info in own)),
     }
+
+
+@cache
+def _loaded() -> ThreadpoolController:
+    """The libraries of threads that were loaded at the first call: to find them takes milliseconds."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
