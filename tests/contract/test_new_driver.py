@@ -25,7 +25,7 @@ def test_its_own_tests_pass(tmp_path: Path) -> None:
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "PYTHONDONTWRITEBYTECODE": "1",
-        "FIELDCAL_CONTRACT_SAMPLES": "20000",
+        "FIELDCAL_CONTRACT_SAMPLES": "2000",
     }
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(package), str(package)]
     done = subprocess.run(command, cwd=package, env=environment, capture_output=True, text=True, check=False)

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
+from agent.acquisition.stalls import few_objects
 from benchmarks.fuzz_drivers import fuzz, parsers
+
+
+@pytest.fixture(autouse=True)
+def _nothing_of_other_tests() -> Iterator[None]:
+    """Memory is measured between two garbage collections for each parser: they need not look at what is there before."""
+    with few_objects():
+        yield
 
 
 @pytest.mark.slow

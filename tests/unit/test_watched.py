@@ -227,11 +227,11 @@ def test_missing_clipped_and_stuck_samples_are_counted_and_their_minutes_left_ou
 
 @pytest.mark.slow
 def test_an_output_that_is_stuck_is_counted_and_gives_no_numbers() -> None:
-    world = World(t_s=0.0, rate_hz=50.0)
-    blocks = [world.block(4.0) for _ in range(200)]
-    held = [replace(own, indications=own.indications * [1, 1, 0] + [0, 0, 9.0]) for own in blocks[20:]]
-    _, results = run(watched_config(prior=PRIOR), [*blocks[:20], *held, *(world.block(4.0) for _ in range(900))])
-    assert hours(results)[0].stuck > 50 * 600
+    world = World()
+    blocks = [world.block() for _ in range(40)]
+    held = [replace(own, indications=own.indications * [1, 1, 0] + [0, 0, 9.0]) for own in blocks[4:]]
+    _, results = run(watched_config(prior=PRIOR), [*blocks[:4], *held, *(world.block() for _ in range(180))])
+    assert hours(results)[0].stuck > 10 * 600
 
 
 @pytest.mark.slow
