@@ -150,7 +150,7 @@ def test_what_the_best_test_of_a_site_reaches() -> None:
         assert_same(line_of("site-runs", line[: line.rindex("|", 0, -1)]), line)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_disturbances(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first lines of slow motion; the others take longer."""
     monkeypatch.setattr(disturbed, "BANDS_HZ", disturbed.BANDS_HZ[:1])

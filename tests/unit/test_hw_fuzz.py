@@ -12,7 +12,7 @@ from benchmarks.fuzz_drivers import fuzz, parsers
 
 @pytest.fixture(autouse=True)
 def _nothing_of_other_tests() -> Iterator[None]:
-    """Memory is measured between two garbage collections for each parser: they need not look at what is there before."""
+    """Garbage is collected twice for each parser: what is there before need not be looked at."""
     with few_objects():
         yield
 
