@@ -247,7 +247,7 @@ class TestTogether:
         rig.rate_hz, rig.sensor = 200.0, rig.build(rate_hz=200.0)  # type: ignore[assignment]
         rig.open()
         late_s, clock = [], ClockModel(rig.rate_hz)
-        for block in rig.blocks(60.0):
+        for block in rig.blocks(30.0):
             numbers = rig.number(block.indications)
             assert (np.diff(numbers) == 1).all()
             assert block.flags & ~BlockFlags.RESTART == BlockFlags.NONE

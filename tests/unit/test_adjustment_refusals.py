@@ -60,13 +60,13 @@ def test_z_outward_with_the_printed_signs_names_the_sign(priors):
     assert "the static sign (gravity) reversed" in _only_reason(adjust(windows, priors))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_reference_with_turned_polarity_is_named_where_the_sensor_is_known():
     windows = _turned(clamp_points(np.random.default_rng(4), ORDINARY).windows, polarity=-1.0)
     assert "the polarity of the reference reversed" in _only_reason(adjust(windows, _nominal()))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_both_turned_are_named_where_the_sensor_is_known():
     windows = _turned(clamp_points(np.random.default_rng(5), ORDINARY).windows, static=-1.0, polarity=-1.0)
     assert "the static sign and the polarity" in _only_reason(adjust(windows, _nominal()))

@@ -339,15 +339,18 @@ def damage(text: bytes, rng: np.random.Generator) -> bytes:
             return before + text[place + piece :]
 
 
-@pytest.mark.one_case
-@pytest.mark.parametrize("sequence", [True, False])
-def test_a_hundred_thousand_damaged_bursts(sequence: bool) -> None:
-    # 50 000 each: no exception, only finite numbers, increasing indices, nothing is held back, most lines are decoded.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sequence", "bursts"),
+    [(True, 10_000), *(pytest.param(k, 50_000, marks=pytest.mark.thorough) for k in (True, False))],
+)
+def test_damaged_bursts(sequence: bool, bursts: int) -> None:
+    # No exception, only finite numbers, increasing indices, nothing is held back, most lines are decoded.
     # In every second half second each burst is damaged: then all lines are dropped, since no blocks of use remain.
     rng = np.random.default_rng(20240601)
     listening = stream(sequence)
     next_index = samples = dropped = bad = 0
-    for burst in range(50_000):
+    for burst in range(bursts):
         texts = [
             b"%d,%.3f\n" % (k, math.sin(k)) if sequence else b"%.3f\n" % math.sin(k)
             for k in range(8 * burst, 8 * burst + 8)
@@ -367,6 +370,6 @@ def test_a_hundred_thousand_damaged_bursts(sequence: bool) -> None:
             assert len(listening._tail) <= 256
             assert listening.size == 0
     # A removed piece destroys up to five of eight lines, the other damages one line
-    assert samples > 0.9 * 25_000 * 8
-    assert dropped > 0.6 * 25_000 * 8
-    assert bad > 10_000
+    assert samples > 0.9 * bursts * 4
+    assert dropped > 0.6 * bursts * 4
+    assert bad > 0.2 * bursts

@@ -131,7 +131,7 @@ def imu(tmp_path: Path) -> Iterator[PtyDevice]:
     device.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_real_agent_is_scraped_on_loopback(tmp_path: Path, imu: PtyDevice) -> None:
     config, output = tmp_path / "gateway.toml", tmp_path / "output"
     config.write_text(CONFIG.format(port=imu.path))

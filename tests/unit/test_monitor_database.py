@@ -218,6 +218,7 @@ def test_the_newest_calibration_of_a_silent_sensor_keeps_its_covariance(kept: Ke
     assert kept.rows("calibration")[1:] == whole[1:]  # the first of the day stays, without it
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("server")
 def test_days_are_partitions_that_are_dropped(request: pytest.FixtureRequest, tmp_path: Path) -> None:
     request.param = "PostgreSQL"

@@ -92,6 +92,7 @@ def test_a_frequency_that_falls_at_all_sensors_is_the_structure(band: int) -> No
     assert not found.gateways
 
 
+@pytest.mark.one_case
 @pytest.mark.parametrize(("by_night", "by_day", "told"), [(0.02, 0.02, 1), (0.01, 0.03, 0), (0.04, 0.0, 0)])
 def test_what_moves_in_loud_hours_otherwise_than_in_quiet_ones_is_no_mode(
     by_night: float, by_day: float, told: int
