@@ -217,6 +217,18 @@ def _waiting(port: int) -> int:
     return int.from_bytes(fcntl.ioctl(port, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
+def neighboured(lines: list[bytes]) -> np.ndarray:  # type: ignore[type-arg]
+    """Number and three values (n, 4) of the lines between two that follow each other.
+
+    A busy machine that is late by 60 ms loses bytes, as a real line does (`PtyDevice`): then two lines become one, and
+    the number of the next line does not follow.
+    """
+    cells = [line.decode().rstrip().split(",") for line in lines]
+    number = np.array([int(first) for first, *_ in cells])
+    kept = np.flatnonzero((np.diff(number)[:-1] == 1) & (np.diff(number)[1:] == 1)) + 1
+    return np.array([cells[k] for k in kept], dtype=np.float64)
+
+
 @pytest.mark.slow
 def test_a_bench_serves_both_devices_from_one_zero_until_interrupted(tmp_path) -> None:
     with running("--preset", "plain", "--seed", "4", "--link", str(tmp_path / "bench")) as process:
@@ -232,14 +244,16 @@ def test_a_bench_serves_both_devices_from_one_zero_until_interrupted(tmp_path) -
             for _ in range(800):
                 received[0].append(sensor.readline())
                 received[1].append(reference.readline())
-            # 799 periods of the faster clock, 1003.3 Hz. No upper limit: a busy machine may be late by any time.
-            assert time.monotonic() - opened_s > SETTLE_S + 799 / 1003.3, "samples came before they were due"
+            took_s = time.monotonic() - opened_s
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 0
     bench = Bench(PRESETS["plain"](4), 4)
-    for lines, values in zip(received, (bench.sensor_values(0, 800), bench.reference_values(0, 800)), strict=True):
-        assert lines[0].startswith(b"#")
-        sent = np.loadtxt([line.decode() for line in lines[1:]], delimiter=",")
-        assert np.array_equal(sent[:, 0], np.arange(800))
-        assert_allclose(sent[:, 1:], values, atol=1e-9)
+    for (first, *lines), values in zip(received, (bench.sensor_values, bench.reference_values), strict=True):
+        assert (first[:1], lines[0][:2]) == (b"#", b"0,")
+        sent = neighboured(lines)
+        assert len(sent) > 400
+        number = sent[:, 0].astype(int)
+        assert_allclose(sent[:, 1:], values(0, number[-1] + 1)[number], atol=1e-9)
+        # The faster clock has 1003.3 Hz. No upper limit: a busy machine may be late by any time.
+        assert took_s > SETTLE_S + number[-1] / 1003.3, "samples came before they were due"
     assert not list(tmp_path.iterdir())
