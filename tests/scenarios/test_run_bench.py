@@ -123,7 +123,8 @@ def test_the_clocks_of_both_devices_are_told_after_a_minute(run: Run) -> None:
         assert clock["nominal_rate_hz"] == 1000.0
         true_hz = {"mems": 1003.3, "reference": 1000.04}[clock["device"]]
         assert abs(clock["rate_hz"] - true_hz) < 4.0 * clock["u_rate_hz"] + 0.02  # a wander of 20 ppm
-        assert 0.0 < clock["jitter_s"] < 0.02
+        assert clock["jitter_s"] < 0.02
+        assert clock["jitter_s"] > 0.0 or clock["arrivals"] == 1  # where the clock has just begun again
     # A busy machine reads late, and may lose samples; the clock then begins again, and says how little it knows.
     for name in ("mems", "reference"):
         assert min(c["u_rate_hz"] - 20.0 * c["jitter_s"] for c in stored if c["device"] == name) < 0.1, stored
