@@ -37,7 +37,12 @@ def record(data_dir: Path, duration_s: float, seed: int = 7, run_id: str = "run-
 
 
 def record_events(
-    data_dir: Path, config: Config, events: Iterable[Event], run_id: str, signer: Signer | None = None
+    data_dir: Path,
+    config: Config,
+    events: Iterable[Event],
+    run_id: str,
+    signer: Signer | None = None,
+    begun_ns: int = EPOCH_NS,
 ) -> None:
     """Feed a new pipeline with the events; write recording and store into a data directory."""
     data_dir.mkdir(parents=True, exist_ok=True)
@@ -48,7 +53,7 @@ def record_events(
     recorder = Recorder(data_dir, devices, sensors, signer=signer, epoch=store.epoch)
     start = RunStart(
         run_id=run_id, site=config.gateway.site, gateway=config.gateway.name, boot_id="boot", t_monotonic_ns=0,
-        t_utc_ns=EPOCH_NS, config_json=config.model_dump_json(), versions={"fieldcal": __version__, **versions()},
+        t_utc_ns=begun_ns, config_json=config.model_dump_json(), versions={"fieldcal": __version__, **versions()},
         fingerprint=fingerprint(), snapshot=pipeline.snapshot(), file_sequence=1, event_sequence=0,
         engine=identity.name(),
     )  # fmt: skip

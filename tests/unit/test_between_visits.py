@@ -144,8 +144,9 @@ def test_the_export_of_a_watched_sensor(tmp_path: Path, capsys: pytest.CaptureFi
     later = {**PRIOR, "sensitivity": (0.98 * S).ravel().tolist(), "calibrated": "2026-09-25"}
     world = World()
     blocks = [world.block() for _ in range(6)]
-    for name, prior in (("first", PRIOR), ("second", later)):
-        record_events(tmp_path / name, watched_config(prior=prior), [opening(), *blocks], name)
+    for name, prior, hour in (("first", PRIOR, 0), ("second", later, 1)):  # one gateway, which lost its store
+        config, begun_ns = watched_config(prior=prior), EPOCH_NS + hour * 3600 * SECOND
+        record_events(tmp_path / name, config, [opening(), *blocks], name, begun_ns=begun_ns)
     recordings = sorted(str(path) for path in tmp_path.glob("*/*.mcap"))
     day = EPOCH_NS // DAY_NS * DAY_NS
     assert 1_788_220_800 * SECOND < day < 1_790_294_400 * SECOND, "between both visits"
