@@ -46,8 +46,9 @@ def uncertainties(watch: SiteWatch, days: int) -> Iterator[Array]:
     of_day = world.scatter**2 * len(BANDS_HZ) * EFFECTIVE / 24.0
     known = np.where(information > 0.0, since, 0.0) / of_day
     learned_days = np.where(weight > 0.0, information / np.where(weight > 0.0, weight, 1.0), 0.0)
-    own = information / verdicts._without(watch.variance(), size, information, steps.days.reshape(watch.shape))
     begin = steps.begins[k]
+    variance = verdicts._without(watch.variance(), size, information, steps.days.reshape(watch.shape))
+    own = information / (variance * watch.band_scatter.without_steps([begin])[0])
     dependent = watch.days_scatter.over(watch.day, [begin])
     before = min(begin - steps.begins[0], verdicts.LONGEST_DAYS)
     walk = verdicts.WALK_PER_ROOT_DAY * np.sqrt(np.array([(watch.day - begin + 1 + before) / 3.0]))
