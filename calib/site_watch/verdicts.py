@@ -244,13 +244,15 @@ def examined(watch: SiteWatch, without: NDArray[np.bool_] | None = None) -> Test
     counts = (since >= FEWEST_SINCE) & (days - since >= FEWEST_DAYS)
     if without is not None:
         counts &= ~without[:, None]
-    variance = _without(watch.variance(), size, information, days) * watch.band_scatter.without_steps(at)
-    information = np.where(counts, information / variance, 0.0)
+    variance, week = _without(watch.variance(), size, information, days), watch.band_scatter.without_steps(at)
+    information = np.where(counts, information / (variance * week), 0.0)
+    # What a band does by itself for weeks is no damage.
+    doubt = np.maximum(watch.band_scatter.today() / week, 1.0)
     ages = np.array([watch.day - begin + 1 for begin in at], dtype=float)
     before = np.minimum([begin - begins[0] for begin in at], LONGEST_DAYS)
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
     inflation = watch.taught() * watch.days_scatter.over(watch.day, at)
-    joint = jointly(size, information, *watch.norm_since(which, size), inflation, walk)
+    joint = jointly(size, information, *watch.norm_since(which, size), inflation, walk, doubt)
     apart = _apart(joint)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
     return Tests(at, joint, apart, bands)

@@ -477,9 +477,10 @@ class Slow(Site):
 
 
 def test_where_days_depend_on_each_other_u_of_a_few_days_holds_it() -> None:
-    """Sizes over u of sound sites, five days after a begin. With u of independent days they were 1.4."""
+    """Sizes over u of sound sites, five days after a begin. With u of independent days they are 1.27, and 1.13 where
+    sums over a week count in units that hold the week already."""
     squares = []
-    for seed in range(6):
+    for seed in range(3):
         site = Slow(20 + seed)
         watch = watched(site, 100)
         for _ in range(12):
@@ -487,7 +488,7 @@ def test_where_days_depend_on_each_other_u_of_a_few_days_holds_it() -> None:
             assert tests is not None
             at = tests.begins.index(watch.day - 4)
             squares.append(np.square(tests.joint.size[at] / tests.joint.u[at])[:, :4].mean())
-    assert np.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.1)
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.06)
 
 
 def steps_of(z: Array) -> tuple[Array, Array, Array, Array]:
@@ -521,6 +522,14 @@ def test_a_sensitivity_is_as_uncertain_as_its_bands_differ() -> None:
     assert jointly(*steps_of(z), one, none).statistic[0, 7, 2] == pytest.approx(5.0 * mean / np.sqrt(25.5), rel=0.01)
     z[7, :, 2] = 5.0
     assert jointly(*steps_of(z), one, none).statistic[0, 7, 2] == pytest.approx(5.0 * mean, rel=0.01)
+
+
+def test_a_doubt_of_bands_counts_where_they_differ_and_in_no_sensitivity() -> None:
+    z, one, none = np.random.default_rng(9).normal(size=(40, 6, 3)), np.ones((1, 40, 7)), np.zeros(1)
+    sure, doubted = (jointly(*steps_of(z), one, none, np.full((1, 40, 6, 6), doubt)) for doubt in (1.0, 4.0))
+    assert doubted.squares == pytest.approx(sure.squares / 4.0, rel=0.01)
+    assert np.array_equal(doubted.size[..., :4], sure.size[..., :4])
+    assert np.array_equal(doubted.u[..., :4], sure.u[..., :4])
 
 
 def test_a_turn_stands_without_the_band_that_says_most() -> None:
