@@ -37,8 +37,8 @@ class Blocks:
     ) -> None:
         self.lags, self.prior_blocks = lags, prior_blocks
         self.keep = [float(np.exp(-1.0 / max(memory_days, FEWEST_BLOCKS * lag))) for lag in lags]
-        self.sums, self.days, self.squares, self.count = (np.zeros((len(lags), *shape)) for _ in range(4))
-        self.past: dict[int, tuple[Array, Array]] = {}
+        self.sums, self.days, self.squares, self.count, self.total = (np.zeros((len(lags), *shape)) for _ in range(5))
+        self.past: dict[int, tuple[Array, Array, Array]] = {}
 
     def update(self, z: Array, there: NDArray[np.bool_]) -> None:
         """Take the residuals of a day; `there`: which of them count."""
@@ -48,6 +48,7 @@ class Blocks:
             full = self.days[k] >= lag
             block = np.clip(self.sums[k], -CLIP * lag**0.5, CLIP * lag**0.5)
             self.squares[k] = self.keep[k] * self.squares[k] + np.where(full, block**2 / lag, 0.0)
+            self.total[k] = self.keep[k] * self.total[k] + np.where(full, block, 0.0)
             self.count[k] = self.keep[k] * self.count[k] + full
             self.sums[k][full] = self.days[k][full] = 0.0
 
@@ -70,7 +71,7 @@ class Blocks:
 
     def remember(self, begins: list[int]) -> None:
         """Keep what is known today, at the last of these begins of steps, and at the others what was known then."""
-        self.past[begins[-1]] = self.squares.copy(), self.count.copy()
+        self.past[begins[-1]] = self.squares.copy(), self.count.copy(), self.total.copy()
         self.past = {begin: self.past[begin] for begin in begins}
 
     def over(self, today: int, begins: list[int]) -> Array:
@@ -82,23 +83,42 @@ class Blocks:
         now, told = self.inflation(), []
         for begin in begins:
             k = int(np.searchsorted(self.lags, today - begin + 1, side="right")) - 1
-            squares, count = self.past[begin]
+            squares, count, _ = self.past[begin]
             middle = np.where(count[k].max(axis=0) >= 1.0, self.inflation(squares, count)[k], now[k])
-            told.append((squares[k] + self.prior_blocks * middle) / (count[k] + self.prior_blocks))
-        return np.asarray(np.maximum(np.array(told), 1.0))
+            told.append(self._drawn(squares[k], count[k], middle))
+        return np.array(told)
+
+    def today(self) -> Array:
+        """Inflation of today by the longest lag, (n, ...)."""
+        return self._drawn(self.squares[-1], self.count[-1], self.inflation()[-1])
+
+    def without_steps(self, begins: list[int]) -> Array:
+        """As `today`, where a step at each of these begins is no scatter: (k, n, ...).
+
+        The blocks since the begin count by what they differ from their mean. Only where nothing is forgotten.
+        """
+        past = np.array([[count[-1], total[-1]] for _, count, total in (self.past[begin] for begin in begins)])
+        since, moved = self.count[-1] - past[:, 0], self.total[-1] - past[:, 1]
+        explained = moved**2 / (self.lags[-1] * np.maximum(since, 1.0))
+        squares = np.maximum(self.squares[-1] - explained, 0.0)
+        return self._drawn(squares, self.count[-1] - (since > 0.0), self.inflation()[-1])
+
+    def _drawn(self, squares: Array, count: Array, middle: Array) -> Array:
+        """A sensor's own inflation, drawn to the median of all as by `prior_blocks`; never less than 1."""
+        return np.asarray(np.maximum((squares + self.prior_blocks * middle) / (count + self.prior_blocks), 1.0))
 
     def snapshot(self) -> dict[str, Any]:
         """All state as plain arrays."""
         now = {name: getattr(self, name).copy() for name in _STATE}
-        past = np.array(list(self.past.values())).reshape(len(self.past), 2, *self.squares.shape)
+        past = np.array(list(self.past.values())).reshape(len(self.past), 3, *self.squares.shape)
         return {**now, "begins": np.array(list(self.past), dtype=np.int64), "past": past}
 
     def load(self, told: dict[str, Any]) -> None:
         """Go on from a snapshot."""
         for name in _STATE:
             setattr(self, name, told[name].copy())
-        self.past = {int(begin): (past[0].copy(), past[1].copy())
+        self.past = {int(begin): (past[0].copy(), past[1].copy(), past[2].copy())
                      for begin, past in zip(told["begins"], told["past"], strict=True)}  # fmt: skip
 
 
-_STATE = ("sums", "days", "squares", "count")
+_STATE = ("sums", "days", "squares", "count", "total")

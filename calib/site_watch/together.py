@@ -129,12 +129,21 @@ class JointChange:
         return self.statistic * self.scatter
 
 
-def jointly(step: Array, information: Array, value: Array, level: Array, inflation: Array, walk: Array) -> JointChange:
+def jointly(
+    step: Array,
+    information: Array,
+    value: Array,
+    level: Array,
+    inflation: Array,
+    walk: Array,
+    doubt: Array | float = 1.0,
+) -> JointChange:
     """All sensors at once, robustly: what a few sensors do differently does not move what is common.
 
     `step`, `information` (k, n, B, 6); `value` (k, n, B, 6), `level` (k, n, B, 3): the channels and the level that the
     norm expects of the days since, without the step; `inflation` (k, n, 7): variance of each direction over what
     independent channels have; `walk` (k,): standard uncertainty by which a sensitivity may have changed by itself.
+    `doubt` (k, n, B, 6): factor of the variance of channels where it is asked whether bands change differently.
     """
     pair, information = _named_only(information)
     inflation = np.where(pair[:, None, None], inflation.max(axis=1, keepdims=True), inflation)
@@ -149,7 +158,7 @@ def jointly(step: Array, information: Array, value: Array, level: Array, inflati
     far = (np.abs(size[..., TURNS]) > FAR * u[..., TURNS]).any(axis=-1)
     far &= np.sum(alone > 0.0, axis=(-2, -1)) > G.shape[-1]  # more channels than unknowns
     rest[far], G[far] = _about_turns(rest[far], alone[far], value[far], level[far])
-    squares, freedom = misfit(rest, alone, G)
+    squares, freedom = misfit(rest, alone / doubt, G)
     inflation = _spread(rest, alone, squares, freedom, inflation)
     size, u = _sized(*scores(rest, alone, G), inflation, walk)
     # Of two the level is the mean, so each shows half of what they differ by, and half of its scatter.

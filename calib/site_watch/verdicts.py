@@ -240,19 +240,22 @@ def examined(watch: SiteWatch, without: NDArray[np.bool_] | None = None) -> Test
     if not which:
         return None
     size, information, since = (part.reshape(-1, *shape) for part in watch.steps.step(which))
-    days, variance = watch.steps.days.reshape(shape), watch.variance()
+    days, at = watch.steps.days.reshape(shape), [begins[k] for k in which]
     counts = (since >= FEWEST_SINCE) & (days - since >= FEWEST_DAYS)
     if without is not None:
         counts &= ~without[:, None]
-    information = np.where(counts, information / _without(variance, size, information, days), 0.0)
-    ages = np.array([watch.day - begins[k] + 1 for k in which], dtype=float)
-    before = np.minimum([begins[k] - begins[0] for k in which], LONGEST_DAYS)
+    variance, week = _without(watch.variance(), size, information, days), watch.band_scatter.without_steps(at)
+    information = np.where(counts, information / (variance * week), 0.0)
+    # What a band does by itself for weeks is no damage.
+    doubt = np.maximum(watch.band_scatter.today() / week, 1.0)
+    ages = np.array([watch.day - begin + 1 for begin in at], dtype=float)
+    before = np.minimum([begin - begins[0] for begin in at], LONGEST_DAYS)
     walk = WALK_PER_ROOT_DAY * np.sqrt((ages + before) / 3.0)  # of the difference of two means
-    inflation = watch.taught() * watch.days_scatter.over(watch.day, [begins[k] for k in which])
-    joint = jointly(size, information, *watch.norm_since(which, size), inflation, walk)
+    inflation = watch.taught() * watch.days_scatter.over(watch.day, at)
+    joint = jointly(size, information, *watch.norm_since(which, size), inflation, walk, doubt)
     apart = _apart(joint)
     bands = (information[..., :3] > 0.0).any(axis=-1).sum(axis=-1)
-    return Tests([begins[k] for k in which], joint, apart, bands)
+    return Tests(at, joint, apart, bands)
 
 
 def _without(variance: Array, size: Array, information: Array, days: Array) -> Array:

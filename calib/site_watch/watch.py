@@ -24,12 +24,13 @@ FEWEST_LEFT = 5  # degrees of freedom for a channel to state its own variance, o
 # on it. Without it days of little noise would count nine times as much as others that scatter by 1.3 times as much: the
 # simulated bridge has 0.0066 to 0.010. docs/site-watch.md says what half and twice of it do.
 U_BAND = 0.0075
+LEAST_SCATTER = 1e-4  # variance of a channel over U_BAND², however little its days differ
 MEMORY_DAYS = 60.0  # of the scatter of days: frost, traffic and wind make it another one in each season
 PRIOR_BLOCKS = 30.0  # by which a sensor's own scatter of days is drawn to that of all: its test has no wide tails
 FEWEST_SENSORS = 2  # with a band, for its common level to be taken out; of two it is their mean
 CHANNELS = 6
 LEVELS = slice(3, TERMS)  # of the regressors: the levels of the band and of the site
-WEEK = 1  # in calib.site_watch.scatter.LAGS_DAYS
+WEEK_DAYS = 7  # over which the days of a channel depend on each other
 U_SELF_TEST = 0.001  # of the log of a response, however little it scatters; only ratios of weights depend on it
 U_FREQUENCY = 0.001  # of the peak frequency of a day; only ratios of weights, and the prior, depend on it
 U_MEAN_MPS2 = 0.001  # of the mean of a day; only ratios of weights depend on it
@@ -57,7 +58,7 @@ class SiteWatch:
         self.frequency_contrasts = Steps(self.shape[0] * self.shape[1] * 3)
         self.u_supply = np.full((self.shape[0], 3), np.nan)  # of the newest self-test
         self.days_scatter = Blocks((self.shape[0], len(DIRECTIONS)), LAGS_DAYS, MEMORY_DAYS, PRIOR_BLOCKS)
-        self.band_scatter = Blocks(self.shape, lags=(1, 7))
+        self.band_scatter = Blocks(self.shape, (WEEK_DAYS,), prior_blocks=PRIOR_DEGREES)
         self.noise_scatter = Blocks((self.shape[0], 3))
         self.mean_scatter = Blocks((self.shape[0], 3))
         self.self_test_scatter = Blocks((self.shape[0], 3))
@@ -91,17 +92,19 @@ class SiteWatch:
         residual = value - expected.reshape(self.shape)
         left = self.steps.days.reshape(self.shape) - TERMS
         known = there & (left >= FEWEST_LEFT)
-        variance = self.variance() * (1.0 / np.where(there, weight, 1.0) + u2.reshape(self.shape))
+        independent = self.variance() * (1.0 / np.where(there, weight, 1.0) + u2.reshape(self.shape))
+        variance = independent * self.band_scatter.today()
         information = np.where(known, 1.0 / variance, 0.0)
         common = _common(residual[..., :3], information[..., :3])
         residual[..., :3] -= common
         value[..., :3] -= common
         z = residual * np.sqrt(information)
         G = design(np.where(left > -TERMS, expected.reshape(self.shape), np.nan), np.nan_to_num(day.level))
-        self._scatter(z, information, G)
+        self._scatter(residual / np.sqrt(independent), z, information, G)
         weight *= np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9))
         self.steps.update(day.number, x, value.ravel(), weight.ravel())
         self.days_scatter.remember(self.steps.begins)
+        self.band_scatter.remember(self.steps.begins)
         degc = np.full(self.shape[0], day.temperature_degc)
         self._follow(self.noise, self.noise_scatter, day.log_noise, np.ones((self.shape[0], 3)), degc)
         untold = visited[:, None] if day.mean_mps2 is not None else True
@@ -125,15 +128,11 @@ class SiteWatch:
         return value.reshape(size.shape), np.nan_to_num(self.origin) + away
 
     def variance(self) -> Array:
-        """Variance of the channels (n, B, 6) over what their noise gives, with dependence over a week.
+        """Variance of the channels (n, B, 6) over what their noise gives.
 
         A channel's own, drawn to the median of all sensors in its band as by PRIOR_DEGREES days.
         """
-        own = pooled(*self.steps.rest(), self.shape)
-        blocks = self.band_scatter
-        enough = blocks.count[WEEK] + PRIOR_DEGREES
-        week = (blocks.squares[WEEK] + PRIOR_DEGREES * blocks.inflation()[WEEK]) / enough
-        return np.asarray(own * np.maximum(week, 1.0))
+        return np.maximum(pooled(*self.steps.rest(), self.shape), LEAST_SCATTER)
 
     def taught(self) -> float:
         """Factor of the variance of each test, at least 1, from the visits that looked at a suspicion."""
@@ -183,10 +182,10 @@ class SiteWatch:
         x[3] = np.column_stack([away - whole, away[:, [0, 0, 1]] - away[:, [1, 2, 2]]])
         return np.repeat(x[:, None], self.shape[0], axis=1).reshape(TERMS, -1)
 
-    def _scatter(self, z: Array, information: Array, G: Array) -> None:
-        """What this day says of the scatter: by channel, and by direction of each sensor."""
+    def _scatter(self, alone: Array, z: Array, information: Array, G: Array) -> None:
+        """What this day says of the scatter: by channel, `alone` as if days were independent, and by direction."""
         there = information > 0.0
-        self.band_scatter.update(z, there)
+        self.band_scatter.update(alone, there)
         clipped = np.where(there, np.clip(z, -HUBER, HUBER), 0.0) / np.sqrt(np.where(there, information, 1.0))
         score, squares = scores(clipped, information, G)
         known = squares > 0.0

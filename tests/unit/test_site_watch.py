@@ -454,6 +454,43 @@ def test_what_was_known_before_a_change_loosens_its_test_and_nothing_since() -> 
     assert blocks.inflation()[0, 0] > 4.0, "today's is larger"
 
 
+def test_a_step_does_not_loosen_its_own_test() -> None:
+    """50 weeks of scatter, and 50 with a step of half a standard deviation of a day: their variance is 2.75.
+    Where it begins, all of them scatter as if there was none, but for 5 blocks of the median."""
+    random, blocks, shape = np.random.default_rng(8), Blocks((40, 1), (7,)), (40, 1)
+    for day in range(700):
+        blocks.update(random.normal(0.5 if day >= 350 else 0.0, 1.0, shape), np.ones(shape, dtype=bool))
+        blocks.remember([day] if day < 350 else [349, day])
+    assert blocks.today().mean() == pytest.approx(1.875, abs=0.05)
+    began, today = blocks.without_steps([349, 699])
+    assert began.mean() == pytest.approx((99.0 + 5.0 * 1.875) / 104.0, abs=0.05)
+    assert np.array_equal(today, blocks.today()), "no block since"
+
+
+class Slow(Site):
+    """Channels whose days depend on each other: AR(1) by 0.6."""
+
+    def day(self, change: Array | None = None) -> Day:
+        day = super().day(change)
+        self.slow = 0.6 * getattr(self, "slow", 0.0) + self.random.normal(0, 0.8 * self.scatter, day.value.shape)
+        return replace(day, value=day.value + 3.0 * self.slow)
+
+
+def test_where_days_depend_on_each_other_u_of_a_few_days_holds_it() -> None:
+    """Sizes over u of sound sites, five days after a begin. With u of independent days they are 1.27, and 1.13 where
+    sums over a week count in units that hold the week already."""
+    squares = []
+    for seed in range(3):
+        site = Slow(20 + seed)
+        watch = watched(site, 100)
+        for _ in range(12):
+            tests = examined(watched(site, 5, watch))
+            assert tests is not None
+            at = tests.begins.index(watch.day - 4)
+            squares.append(np.square(tests.joint.size[at] / tests.joint.u[at])[:, :4].mean())
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1.0, abs=0.06)
+
+
 def steps_of(z: Array) -> tuple[Array, Array, Array, Array]:
     """Steps (1, n, B, 6) that are z standard deviations in the outputs alone, information, channels, levels."""
     step, information = np.zeros((1, *z.shape[:2], 6)), np.full((1, *z.shape[:2], 6), 1e4)
@@ -485,6 +522,14 @@ def test_a_sensitivity_is_as_uncertain_as_its_bands_differ() -> None:
     assert jointly(*steps_of(z), one, none).statistic[0, 7, 2] == pytest.approx(5.0 * mean / np.sqrt(25.5), rel=0.01)
     z[7, :, 2] = 5.0
     assert jointly(*steps_of(z), one, none).statistic[0, 7, 2] == pytest.approx(5.0 * mean, rel=0.01)
+
+
+def test_a_doubt_of_bands_counts_where_they_differ_and_in_no_sensitivity() -> None:
+    z, one, none = np.random.default_rng(9).normal(size=(40, 6, 3)), np.ones((1, 40, 7)), np.zeros(1)
+    sure, doubted = (jointly(*steps_of(z), one, none, np.full((1, 40, 6, 6), doubt)) for doubt in (1.0, 4.0))
+    assert doubted.squares == pytest.approx(sure.squares / 4.0, rel=0.01)
+    assert np.array_equal(doubted.size[..., :4], sure.size[..., :4])
+    assert np.array_equal(doubted.u[..., :4], sure.u[..., :4])
 
 
 def test_a_turn_stands_without_the_band_that_says_most() -> None:
