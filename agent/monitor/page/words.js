@@ -1,7 +1,7 @@
 // What is said of a sensor: its verdicts in sentences, what else is steady, and what a person can do.
 import { commandLine } from "./commands.js";
 import { clean, isUnheard, make } from "./common.js";
-import { ago, AXES, band, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, signed, symbol, two } from "./format.js";
+import { ago, AXES, band, day, DAY_NS, duration, finite, MAIN, moment, NAMES, now, rounded, short, signed, symbol, two } from "./format.js";
 import { copier, spark } from "./parts.js";
 import { suspectedSteps, suspectedUsable, suspectedWords } from "./site-watch.js";
 
@@ -130,11 +130,11 @@ export function explanation(reason) {
   return { held: Number(found.held), none: Number(found.none), limit: Number(found.limit), agree: found.how.startsWith("agree"), fits: found.fits === "Best fits", best: found.best ?? "", least: Number(found.least), alike, todo: found.todo };
 }
 
-// "reference drift (reference_drift_z +9.96 %)" as "reference drift along z (+10 %)"; what has another form as it is.
+// "reference drift (reference_drift_z +9.96 %)" as "reference drift along z (+9.96 %)"; what has another form as it is.
 export function cause(told) {
   const found = /^(?<what>.+) \((?<name>\S+) (?<size>[-+]\S+)(?<unit> .+)?\)$/.exec(told)?.groups;
   if (!found) return [told];
-  const size = ` (${signed(Number(found.size), Math.abs(0.1 * Number(found.size)))}${(found.unit ?? "").replace("m/s2", "m/s²")})`, axis = /_([xyz])$/.exec(found.name)?.[1];
+  const sign = Number(found.size) > 0 ? "+" : "", size = ` (${sign}${short(Number(found.size))}${(found.unit ?? "").replace("m/s2", "m/s²")})`, axis = /_([xyz])$/.exec(found.name)?.[1];
   if (NAMES.includes(found.name)) return [found.what, " ", symbol(found.name), size];
   return [found.what, axis ? ` along ${axis}` : "", size];
 }
