@@ -28,6 +28,7 @@ def outcome_of(seed: int, gain: float, from_s: float = 0.5 * SECONDS) -> Outcome
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "from_s"), [(1.03, 150.0), (0.97, 150.0), (1.03, 100.0)])
 def test_a_gain_that_changes_is_told_and_covered(gain: float, from_s: float) -> None:
     found = outcome_of(1, gain, from_s)
@@ -40,6 +41,7 @@ def test_a_gain_that_changes_is_told_and_covered(gain: float, from_s: float) -> 
     assert by_change["Sxx"] < 0.0005  # what did not change
 
 
+@pytest.mark.slow
 def test_a_sound_recording_tells_nothing() -> None:
     for seed in range(4):
         found = outcome_of(seed, 1.0)

@@ -61,6 +61,7 @@ def bend_of(of: Points, u_end_s: float = U_END_S, independent: float = 0.32) -> 
     return clock_bend(*devices(u_end_s), of, independent)
 
 
+@pytest.mark.slow
 def test_the_bend_and_its_uncertainty() -> None:
     """Of 60 bends that are drawn from what the clocks leave open, the mean square over the covariance is 2 for two
     coefficients, within its 99.9 % band of 1.3 to 2.9. Half or twice the covariance is outside."""
@@ -176,6 +177,7 @@ def test_outputs_that_show_nothing_tell_nothing() -> None:
     assert not found.left_in(points(6, np.zeros(2))).any()
 
 
+@pytest.mark.slow
 def test_windows_on_line_keep_their_verdicts_where_reads_are_late() -> None:
     """A crane that blows move, both devices read 20 to 60 ms late: the clocks leave 1 to 3 ms between the middle and
     the ends of a window open. No window of the first ten contradicts; of windows with that lag in them, four of the

@@ -42,6 +42,7 @@ def quiet_window(seed: int, loud_mps2: float) -> Window:
     return max((w for w in windows if w.used), key=lambda w: w.points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loud_mps2", [0.01, 3.0])
 def test_the_slopes_of_the_quiet_window_are_right(loud_mps2: float) -> None:
     """The integral of the reference has a straight line from the loud part: chi-squared was 90 times as large."""

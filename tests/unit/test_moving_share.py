@@ -45,6 +45,7 @@ def test_the_share_of_a_floor_that_moves_is_found(floor_mps2: float) -> None:
     np.testing.assert_allclose(found.mean(axis=0), motion / (motion + noise), atol=0.08)  # z is 16 % noise
 
 
+@pytest.mark.slow
 def test_what_looks_like_noise_and_is_motion_still_has_a_band() -> None:
     """The sensor shows all of it, so the noise that is subtracted is next to nothing. With none at all the bands of
     the filter's edge would count in this window, and not in the next one."""

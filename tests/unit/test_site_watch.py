@@ -476,6 +476,7 @@ class Slow(Site):
         return replace(day, value=day.value + 3.0 * self.slow)
 
 
+@pytest.mark.slow
 def test_where_days_depend_on_each_other_u_of_a_few_days_holds_it() -> None:
     """Sizes over u of sound sites, five days after a begin. With u of independent days they are 1.27, and 1.13 where
     sums over a week count in units that hold the week already."""
