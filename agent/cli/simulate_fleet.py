@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from agent.config.whole_files import write_whole
 from agent.delivery.ending import StopRequest
 from agent.terminal.text import say
 
@@ -127,7 +128,8 @@ def _step_of(simulated: FleetProcesses, stop: StopEvent, truth: Path | None, see
         try:
             made = simulated.step(t_utc_ns)
             if truth is not None:
-                _write_truth(truth, {"seed": seed, "t_utc_ns": t_utc_ns, "gateways": simulated.truth()})
+                told = {"seed": seed, "t_utc_ns": t_utc_ns, "gateways": simulated.truth()}
+                write_whole(truth, json.dumps(told).encode())  # a reader never has half of it
         except ProcessEnded:
             if not stop.is_set():
                 raise
@@ -135,13 +137,6 @@ def _step_of(simulated: FleetProcesses, stop: StopEvent, truth: Path | None, see
         return made
 
     return step
-
-
-def _write_truth(path: Path, truth: dict[str, Any]) -> None:
-    """Replace the file at once, so that a reader never has half of it. Raises OSError."""
-    new = path.with_name(f"{path.name}.new")
-    new.write_text(json.dumps(truth))
-    new.replace(path)
 
 
 def _run(step: Callable[[int], int], stop: StopEvent, options: FleetOptions, duration_s: float | None) -> int:

@@ -11,13 +11,12 @@ import numpy as np
 from agent.reading.dialect import Dialect, TableColumn
 from agent.reading.source import Array
 from calib.recorded.choice import names_time
-from calib.recorded.table import second_of
+from calib.recorded.table import FIRST_DATE_S, second_of
 from calib.recorded.units import split, unit_of
 
 FEWEST_ROWS = 20  # from which two columns can be told to be alike
 RESOLUTIONS = 3  # of the coarsest column, over which the rows must go
 FINE = 0.1  # of the step between rows: a resolution that is fine enough, since arrivals are fitted
-FIRST_DATE_S = 1e8  # later times are dates
 _FRACTION = re.compile(r"(?:[.,](?P<digits>\d*))?(?:[eE](?P<power>[-+]?\d+))?\D*$")
 
 

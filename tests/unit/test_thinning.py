@@ -68,8 +68,7 @@ def test_an_unknown_begins_with_the_first_window_that_has_it_however_windows_wer
 def test_windows_with_lags_of_their_own_tell_together_what_they_tell_apart() -> None:
     """Each of 30 windows moves another way and has its own lag, of which the clocks leave 1 ms open. S by the merged
     record is that of least squares over all slopes with a lag for each window, within 0.3 of its u, and its rows have
-    no more scatter than noise. With the lag of the first window for all
-    it was 5 u off."""
+    no more scatter than noise. With the lag of the first window for all it was 5 u off."""
     random, omega, noise, count = np.random.default_rng(7), 4.0, 1e-3, 30
     windows, columns, observed = [], [], []
     for w in range(count):
@@ -78,7 +77,7 @@ def test_windows_with_lags_of_their_own_tell_together_what_they_tell_apart() -> 
         lag_s = 1e-3 * random.normal()
         slopes = root @ np.vstack([S, -lag_s * S]) + noise * random.normal(size=(6, 3))
         taken_s = lag_s if w % 2 else 0.0  # from half of them the front end took it out
-        slopes[:, :] += taken_s * root[:, 3:] @ S
+        slopes += taken_s * root[:, 3:] @ S
         windows.append(replace(told(BESIDE, Truth(S, Q), 0.0), root=root, slopes=slopes, lag_s=taken_s, u_lag_s=1e-3))
         own = np.zeros((18, 9 + count))
         own[:, :9] = np.kron(root[:, :3], np.eye(3))
